@@ -1,6 +1,7 @@
 """Kinds of events of projects and of the server. The type checker verifies that no other kinds are recorded.
 
-The audit log consists of the events that concern access or deletion; their kinds are the kinds of audit entries.
+The audit log consists of the events whose kinds are in `AuditKind`: changes of access, limits, protected branches,
+webhooks, schedules, scripts and studies, and deletions and restorations.
 """
 
 from __future__ import annotations

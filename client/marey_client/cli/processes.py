@@ -229,7 +229,7 @@ def backup_database(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Write a consistent copy of the database; the server may be running."""
+    """Write a consistent copy of an SQLite database; the server may be running. For Postgres, use pg_dump."""
     _database("backup", data, database_url, target=target)
 
 
@@ -239,7 +239,7 @@ def restore_database(
     data: DataFolder = None,
     database_url: DatabaseUrl = None,
 ) -> None:
-    """Restore a backup as a new database, which must not exist yet."""
+    """Restore a backup as a new SQLite database, which must not exist yet. For Postgres, use pg_restore."""
     _database("restore", data, database_url, source=source)
 
 

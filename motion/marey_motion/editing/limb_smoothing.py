@@ -131,11 +131,12 @@ class LimbSmoother:
         return _Attempt(motion, (steps - allowed_steps(self.usual, moved, self.reach)).max(axis=1))
 
     def _slowed(self, vectors: Floats, jumps: Flags, width: int) -> Floats:
-        """Slow down the turns of the path of the limb's end, and lead the path round the limb's first joint.
+        """Let the limb's end turn more slowly round the limb's first joint, and keep the end away from this joint.
 
-        `vectors` (n, 3) are the positions of the path relative to the first joint; `jumps` (n,) are the frames next to
-        a jump. Up to `width` frames away from these frames, and from frames in which the limb would have to fold too
-        far, the direction changes evenly, and the distance is at least that of the folded limb.
+        `vectors` (n, 3) are the positions of the end relative to the first joint; `jumps` (n,) is True in frames next
+        to a jump. A frame is changed if it is at most `width` frames from a frame next to a jump, or from a frame in
+        which the limb would have to fold too far. In each run of such frames, the direction turns smoothly from the
+        first direction to the last, starting and ending at rest, and the distance is at least that of the folded limb.
         """
         from scipy.ndimage import maximum_filter1d
 

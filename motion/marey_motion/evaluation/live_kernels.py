@@ -78,9 +78,10 @@ def _smooth(take, filters, frame, shortest_mean):
 
 @compiled
 def newest_window(take, duration_s, window):
-    """Write to `window` the speed, turn rate, forward and strafe velocity of the newest `duration_s` seconds of `take`.
+    """Write to `window` the speed, turn rate, forward and strafe velocity of the newest window of `take`.
 
-    Returns whether the take is long enough.
+    `duration_s` is the duration of a window, for whose steps the buffers of `take` have room. Returns whether the take
+    is long enough.
     """
     frame, span = take.counters[SMOOTHED] - 1, take.steps.shape[0]
     if frame < span:

@@ -72,7 +72,10 @@ def described_skeleton(file: FileToImport, skeleton: Skeleton) -> ImportedItem:
             original["model"] = original_of("mapping", mapping, place, file.companion_digest)
     elif place != name:
         raise FormatError(
-            "the file is not a skeleton model: it has no field 'joints'", code="document-unknown", file=place
+            "the file is named like a skeleton model, but is none: a skeleton model has an object 'joints', and none "
+            "of the fields 'root', 'jointDescs' and 'sspm'; correct the file, or import the skeleton without it",
+            code="document-unknown",
+            file=place,
         )
     return replace(item, parts={**item.parts, "mapping": {**mapping, "predecessor": original}})
 

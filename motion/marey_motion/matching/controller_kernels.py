@@ -149,9 +149,9 @@ def fill_query(index, playback, rules, desired, row, when, x, z, heading, query)
 def _distance_cost(index, points, row, other, query, first, limit):
     """Compute the cost of row `other` as the successor of row `row`.
 
-    The cost is the squared difference between the row's and the query's trajectory features (from dimension `first`
-    on), plus the distances, in metres, between the pose joints of the two rows. If the cost exceeds `limit`, any value
-    above `limit` is returned.
+    The cost is the squared difference between the trajectory features of `other` and those of the query (from dimension
+    `first` on), plus the distances, in metres, between the pose joints of `row` and `other`. If the cost exceeds
+    `limit`, any value above `limit` is returned.
     """
     cost = 0.0
     for d in range(first, query.shape[0]):

@@ -126,8 +126,8 @@ def _tables_for(example: Example, metric: PerceptualMetric) -> MetricTables:
     tables = metric_tables(metric, example.poses.present)
     if tables is None:
         raise MotionError(
-            "the joint mapping of the example's skeleton contains none of the joints that a component of the metric "
-            "compares; map these joints, or use another metric",
+            "the joint mapping of the example's skeleton lacks joints that the metric compares; map head, arms and "
+            "legs, or use another metric",
             code="mapping-invalid",
         )
     return tables

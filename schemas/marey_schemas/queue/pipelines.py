@@ -97,9 +97,11 @@ class PipelineError(ValueError):
 
 
 def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
-    """Sort the names of the steps so that each step comes after its dependencies; otherwise, the given order is kept.
+    """Sort the names of the steps so that each step comes after its dependencies.
 
-    Raises `PipelineError` for a step that does not exist, and for circular dependencies.
+    First come the steps without dependencies, then those that depend only on these, and so on. In each of these groups,
+    the steps keep the given order. Raises `PipelineError` for a step that does not exist, and for circular
+    dependencies.
     """
     places = {name: dict(_needed(name, step)) for name, step in pipeline.steps.items()}
     for needed in places.values():

@@ -323,7 +323,11 @@ def _check_folder(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
 
 
 def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
-    """Return a fault for each entry that is damaged, or whose content no revision of the project has."""
+    """Check the entries of all versions of a dataset.
+
+    Returns a fault for each damaged entry, and one for each content that entries have, but no revision of the project;
+    the latter names one of the paths. Damaged chunks are skipped, because `_check_chunk` reports them.
+    """
     trees = select(dataset_commit.c.tree).where(dataset_commit.c.dataset_id == row.id)
     waiting = set(tx.execute(trees).scalars())
     seen: set[str] = set()
@@ -334,7 +338,7 @@ def _check_entries(tx: Transaction, row: Row[Any]) -> list[StoreDefect]:
         seen |= batch
         entries: dict[str, str] = {}
         for digest, data in StoredChunks(tx).load(batch).items():
-            with suppress(DamagedChunk):  # which `_check_chunk` reports
+            with suppress(DamagedChunk):
                 chunk = decode(digest, data)
                 if isinstance(chunk, Branch):
                     waiting |= {child.digest for child in chunk.children} - seen

@@ -45,8 +45,8 @@ Base = Annotated[
     list[str] | None,
     typer.Option(
         metavar=CONFLICT,
-        help="Resolve the conflict in this entry, or in this part of it, with the content before both changes; may be "
-        "repeated.",
+        help="Resolve the conflict in this entry, or in this part of it, with the content of the base, with which "
+        "both sides are compared; may be repeated.",
     ),
 ]
 Others = Annotated[

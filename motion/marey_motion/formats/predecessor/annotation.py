@@ -144,8 +144,8 @@ def layers_of_document(
     assert refused is not None
     if isinstance(by_label, Mapping) and len(by_label) > MOST_LAYERS:
         raise FormatLimit(
-            f"{refused.message}; overlapping labels are imported as one annotation each, for at most {MOST_LAYERS} "
-            f"labels, not {len(by_label)}",
+            f"{refused.message}. If labels overlap, each label becomes an annotation of its own, but the file has "
+            f"{len(by_label)} labels, more than the limit of {MOST_LAYERS}; correct this section, or split the file",
             file=file,
         )
     if isinstance(by_label, Mapping) and len(by_label) > 1:

@@ -49,7 +49,10 @@ def limit_above(highest: NDArray[np.float64], keyframes: Mapping[str, int], heig
 
 
 def _names(keyframes: Mapping[str, int], frame_count: int) -> dict[int, str]:
-    """Return the shortened labels of each frame between the first and the last that is a keyframe, in their order."""
+    """Return the text for each keyframe, by frame in ascending order: its labels, joined and shortened.
+
+    Keyframes in the first and in the last frame of the clip are left out.
+    """
     labels: dict[int, list[str]] = {}
     for label, frame in keyframes.items():
         if 0 < frame < frame_count - 1:

@@ -45,7 +45,8 @@ class WorkerJobs:
     async def create(self, jobs: Iterable[Manifest]) -> Sequence[Manifest]:
         """Create Jobs with their Secrets, and return them.
 
-        A Job whose name exists already is not created, but returned.
+        A Job that exists already is returned. Raises `ObjectRefused` if the cluster refuses a Job, or if it has another
+        Job with the same name.
         """
         return await self.all(self._create(job) for job in jobs)
 

@@ -53,7 +53,10 @@ class SharedResult(NamedTuple):
 
     @classmethod
     def of(cls, one: Any, *, finished: bool = False, leased: bool = False) -> SharedResult:
-        """Return a job, given as a database row or as a `NewJob`, as a job whose result others can share."""
+        """Return the `SharedResult` of a job, which is a database row or a `NewJob`.
+
+        `finished` says whether the job has succeeded, `leased` whether a worker runs it.
+        """
         return cls(one.id, finished, leased, one.labels_key, one.priority, one.concurrency_key)
 
     def is_no_later_than(self, other: Any) -> bool:
