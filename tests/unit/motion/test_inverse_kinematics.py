@@ -485,6 +485,22 @@ def test_the_end_of_a_limb_keeps_or_gets_an_orientation(body: Skeleton) -> None:
     assert np.abs(tips - near).max() < 1e-9
 
 
+def test_a_limb_that_is_left_as_it_was_says_whether_its_targets_are_reached(body: Skeleton) -> None:
+    """An orientation that turns a tool away from its position increases the error; such frames keep their pose."""
+    motion, random = _moved(body, frames=400, seed=3, size_rad=0.9), np.random.default_rng(0)
+    limb, tool = limb_of(body, "LeftArm", "LeftForeArm", "LeftHand"), (0.0, 0.3, 0.0)
+    spins = _spins(body, motion, limb.end)
+    tips = motion.positions(body)[:, limb.end] + quaternions.rotate_vectors(spins, tool)
+    position = PositionTarget(limb.end, tips + random.normal(0.0, 0.02, tips.shape), offset=tool)
+    turns = quaternions.from_rotation_vector(random.normal(0.0, 0.3, (400, 3)))
+    orientation = OrientationTarget(limb.end, quaternions.multiply(spins, turns))
+    options = SolverOptions(tolerance_m=0.3, tolerance_rad=0.01)
+    solved = solve_two_bone(body, motion, limb, position, orientation=orientation, options=options)
+    assert (solved.iterations == 0).any()
+    errors = measure_residuals(body, solved.motion, [position, orientation])
+    np.testing.assert_array_equal(solved.reached, (errors <= (0.3, 0.01)).all(axis=1))
+
+
 @pytest.mark.parametrize("solver", ["ccd", "least_squares"])
 def test_an_orientation_turns_the_end_of_a_limb_alone_unless_a_limit_stops_it(
     body: Skeleton, solver: Literal["ccd", "least_squares"]

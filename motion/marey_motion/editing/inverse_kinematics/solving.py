@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from marey_motion.arrays import Floats
+from marey_motion.arrays import Flags, Floats
 from marey_motion.editing.inverse_kinematics.limbs import TwoBoneLimb, limb_targets
 from marey_motion.editing.inverse_kinematics.neighbouring import solve_in_order
 from marey_motion.editing.inverse_kinematics.problem import IkProblem, SolverResult, pose_problem
@@ -310,7 +310,7 @@ def solve_two_bone(
     problem = pose_problem(skeleton, motion, targets, Freedom(limb.joints))
     found = problem.found
     _measure(problem, options, found.before, found)
-    before = problem.rotations.copy()
+    before, reached_before = problem.rotations.copy(), found.reached.copy()
     kernel_limb = _kernel_limb(problem, limb, "given" if orientation else ending, damping_zone_rad)
     two_bone_kernels.reach_frames(
         kernel_limb,
@@ -325,7 +325,8 @@ def solve_two_bone(
         pole = None if position.pole is None else np.asarray(position.pole, dtype=np.float64)
         swivel_coherently(kernel_limb, problem, before, neighbours, pole)
     _measure(problem, options, found.after, found)
-    _keep_better(problem, before, found, _ROUNDING if position.pole is None else _WITH_POLE)
+    worse = _restore_better(problem, before, found, _ROUNDING if position.pole is None else _WITH_POLE)
+    found.reached[worse] = reached_before[worse]
     return _solved(motion, problem, found)
 
 
@@ -345,18 +346,19 @@ def _kernel_limb(
     return _LimbKernel(start, middle, end, offset, hinge, float(damping_zone_rad), endings[ending])
 
 
-def _keep_better(problem: IkProblem, before: Floats, found: SolverResult, allowed: float) -> None:
+def _restore_better(problem: IkProblem, before: Floats, found: SolverResult, allowed: float) -> Flags:
     """Restore the given pose and its errors in each frame whose error was increased by the closed form.
 
     `before` (F, K, 4) are the given local rotations, and `allowed` is by how much the sum of squared errors may
     increase. The error can increase if the wrist turns a tool away from its target. In all other frames, the number of
-    iterations is set to 1.
+    iterations is set to 1. Returns (F,) whether each frame was restored.
     """
     squares = problem.targets.scales**2
-    worse = (found.after**2) @ squares > (found.before**2) @ squares + allowed
+    worse: Flags = (found.after**2) @ squares > (found.before**2) @ squares + allowed
     problem.rotations[worse] = before[worse]
     found.after[worse] = found.before[worse]
     found.iterations[~worse] = 1
+    return worse
 
 
 def _measure(problem: IkProblem, options: SolverOptions, residuals: Floats, found: SolverResult) -> None:
