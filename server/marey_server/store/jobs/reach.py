@@ -109,13 +109,9 @@ def _pins_of(tx: Transaction) -> Pins:
         row = tx.execute(select(job.c.inputs, job.c.params).where(job.c.id == job_id)).one_or_none()
         inputs: dict[str, Any] = {} if row is None else row.inputs
         places = frozenset((pin["item"], pin["revision"]) for many in inputs.values() for pin in many if "item" in pin)
-        pins = Pins(places, frozenset(() if row is None else _ids_in(json.dumps(row.params))))
+        pins = Pins(places, frozenset(() if row is None else ids_in(json.dumps(row.params))))
         _pins.put(job_id, pins)
     return pins
-
-
-def _ids_in(text: str) -> list[str]:
-    return ids_in(text)
 
 
 # -- what documents name ----------------------------------------------------------------------------------------------
@@ -143,7 +139,7 @@ def _follow(tx: Transaction, pins: Pins) -> set[str]:
         found: set[str] = set()
         for row in _texts(tx, sorted(ahead)):
             if (row.item_id, row.number) in pinned or row.item_id in known or row.item_id in pins.named:
-                found.update(_ids_in(row.text))
+                found.update(ids_in(row.text))
                 searched += 1
         ahead = frozenset(found - known - ahead)
         known |= found
