@@ -104,9 +104,26 @@ def fuzzed_server(database: Database, folder: Path) -> Iterator[FuzzedServer]:
 @functools.cache
 def operations() -> Mapping[str, AnyOperation]:
     """Return every operation of the OpenAPI document by its label, as in `GET /api/v1/projects`."""
-    schema = schemathesis.openapi.from_dict(deepcopy(api_document()), config=schemathesis.config.SchemathesisConfig())
+    document = _with_plain_arrays(deepcopy(api_document()))
+    schema = schemathesis.openapi.from_dict(document, config=schemathesis.config.SchemathesisConfig())
     results: Any = schema.get_all_operations()
     return {operation.label: operation for operation in (result.ok() for result in results)}
+
+
+def _with_plain_arrays(document: Any) -> Any:
+    """Write tuples whose elements have one schema as arrays of a fixed length, which accept the same values.
+
+    In responses, schemathesis 4.32 writes `prefixItems` in the form of JSON Schema draft 7, and then refuses this form.
+    """
+    if isinstance(document, list):
+        return [_with_plain_arrays(one) for one in document]
+    if not isinstance(document, dict):
+        return document
+    schema = {name: _with_plain_arrays(one) for name, one in document.items()}
+    elements = schema.get("prefixItems") or [None]
+    if isinstance(elements, list) and None not in elements and all(one == elements[0] for one in elements):
+        schema["items"] = schema.pop("prefixItems")[0]
+    return schema
 
 
 def probes() -> Iterator[tuple[str, GenerationMode]]:
