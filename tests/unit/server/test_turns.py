@@ -67,9 +67,10 @@ def expected(shares: Sequence[Share], most: int, clock: Iterator[int]) -> Counte
 
 def play(desk: Desk, steps: Sequence[tuple[str, int, int]]) -> None:
     """Play steps with three new projects, and compare each claim with the model; at the end, no jobs are left."""
-    shares = [Share(replace(desk, project=f"share{next(_NUMBERS)}")) for _ in range(3)]
-    for share in shares:
-        desk.database.write(desk.user, projects.create_project, ProjectCreate(name=share.desk.project))
+    wanted = [ProjectCreate(name=f"share{next(_NUMBERS)}") for _ in range(3)]
+    made = [desk.database.write(desk.user, projects.create_project, one) for one in wanted]
+    # Equals take turns in the order of their ids, which is random for projects of one millisecond.
+    shares = [Share(replace(desk, project=one.name)) for one in sorted(made, key=lambda one: one.id)]
     clock = itertools.count(1)
     try:
         for what, at, number in steps:
