@@ -55,7 +55,7 @@ def test_the_commands_of_the_page_work_in_their_order(
     assert "opened the proposal 1" in follow([commit, propose])[1]
     ls, show, diff, *rest = follow(next(blocks).splitlines(), MAREY_TOKEN=token)
     assert "Describe the walk" in ls
-    assert "there are 0" in show
+    assert "it has 0" in show
     assert "info changed" in diff
     assert "recorded the verdict request-changes" in rest[-1]
     change_walk("the left foot slides")
