@@ -241,7 +241,7 @@ class Items(Generic[Handle]):
         for path in dict.fromkeys((name, name.removeprefix(f"{self.project}/"))):
             for found in self.list(path=path, page_size=1):
                 return found
-        if not name or "/" in name:
+        if name in ("", ".", "..") or "/" in name:
             return None
         try:
             return self.get(name)

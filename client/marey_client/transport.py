@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from marey_client.asynchronous.interruption import note_at_hand, stop_if_interrupted
 from marey_client.credentials import BearerToken, TokenFile, require_address, resolve, trusted_authorities
-from marey_client.errors import RequestFailed, UnexpectedAnswer, Unreachable, error_of
+from marey_client.errors import BadArgument, RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_client.tracing import TracedRequest, calling
 from marey_client.unanswered import explain_silence, media_type_of, not_of_marey, require_marey, server_of
@@ -44,6 +44,7 @@ LIMITS = httpx.Limits(max_connections=32, max_keepalive_connections=16)
 TRIES_TO_REACH = 3
 """Number of attempts for the first request: a server that has never answered is probably not running."""
 
+_DOTS = frozenset((".", ".."))
 _BROKEN = (httpx.NetworkError, httpx.RemoteProtocolError)
 """Failures of connections to a program that listens; `httpx.NetworkError` includes failures to connect."""
 
@@ -349,7 +350,13 @@ class _Connections:
 
 
 def _quoted(path: str) -> str:
-    """Return a path with its names percent-encoded, because names may contain any character."""
+    """Return a path with its names percent-encoded, because names may contain any character.
+
+    Raises `BadArgument` if a name is `.` or `..`: HTTP clients and proxies resolve such names, even percent-encoded
+    ones, so the request would reach another address, such as that of the project instead of that of a member.
+    """
+    if not _DOTS.isdisjoint(path.split("/")):
+        raise BadArgument(f"{path}: a name cannot be . or ..")
     return quote(path, safe="/:@!$&'()*+,;=~")
 
 

@@ -60,6 +60,20 @@ def test_a_name_of_any_characters_stands_in_the_address_as_it_is(script: Scripte
     assert not script.requests[0].url.query
 
 
+@pytest.mark.parametrize("name", [".", "..", "../../users/ann", "x/../.."])
+def test_a_name_never_leads_to_another_address(script: ScriptedServer, name: str) -> None:
+    lab = script.marey().project("lab")
+    with pytest.raises(errors.BadArgument, match="a name cannot be"):
+        lab.members.remove(name)  # with the name .., this deleted the project
+    assert not script.requests
+
+
+@pytest.mark.parametrize("name", [".", ".."])
+def test_no_item_is_called_by_dots_alone(script: ScriptedServer, name: str) -> None:
+    script.answers = [ok({"items": []})]
+    assert name not in script.marey().project("lab").clips
+
+
 def test_a_post_is_sent_again_under_the_same_idempotency_key(script: ScriptedServer) -> None:
     script.answers = [LOST, ok(PROJECT, 201), ok(PROJECT)]
     script.marey().create_project(ProjectCreate(name="lab"))
