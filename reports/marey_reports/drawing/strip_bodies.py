@@ -26,6 +26,7 @@ FLOOR_SHARE = 0.09  # of a cell's height: the floor's distance from its lower ed
 HEAD_SHARE = 0.055  # radius of the head, of the height of the highest point
 LINE_POINTS = 1.7
 RIM_STOPS = 0.05  # inches before a bone's ends
+DOT_IN = 0.03  # radius of a skeleton of one joint
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,8 @@ def shapes_of(body: StickFigure, drawn: Iterable[Floats]) -> BodyShapes:
         shown[body.head[0]] = False  # the circle stands for it
     sides = sorted({int(side) for side in body.sides})
     bones = {side: body.bones[shown & (body.sides == side)] for side in sides}
-    heights = np.concatenate([np.ptp(points[..., body.bones[:, 0], 1], axis=-1).ravel() for points in drawn])
+    outer = np.append(body.bones[:, 0], body.pelvis)  # the pelvis, because a skeleton of one joint has no bones
+    heights = np.concatenate([np.ptp(points[..., outer, 1], axis=-1).ravel() for points in drawn])
     return BodyShapes(
         {side: runs_of(bones[side]) for side in sides},
         bones,
@@ -101,10 +103,16 @@ def shapes_of(body: StickFigure, drawn: Iterable[Floats]) -> BodyShapes:
 def draw_body(
     axes: Axes, shapes: BodyShapes, stage: StripCell, points: Floats, look: BodyStyle, frame: BboxBase
 ) -> None:
-    """Draw the bones of a body with points (P, 3): each side as one shape, the far side before the near one."""
+    """Draw the bones of a body with points (P, 3): each side as one shape, the far side before the near one.
+
+    A skeleton of one joint, such as that of a tracked prop, is drawn as a dot.
+    """
     from matplotlib.patches import Circle, PathPatch
 
     seen = stage.placed(points)
+    if not shapes.bones:
+        dot = Circle(tuple(seen[0, :2]), DOT_IN, color=look.colour or INK, alpha=look.alpha, linewidth=0.0)
+        _add(axes, dot, frame)
     options: dict[str, Any] = {"facecolor": "none", "capstyle": "round", "joinstyle": "round"}
     sides = sorted(shapes.bones, key=lambda side: float(seen[shapes.bones[side], 2].mean()))
     for place, side in enumerate(sides):

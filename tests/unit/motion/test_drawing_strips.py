@@ -11,6 +11,7 @@ from tests.support.present import present
 
 from marey_motion import kinematics
 from marey_motion.arrays import Floats
+from marey_motion.clip import Clip
 from marey_motion.gait import generate_gait
 from marey_motion.skeleton import Skeleton
 from marey_reports.drawing.paper import COLOURS, INK, REFERENCE
@@ -179,3 +180,13 @@ def test_a_motion_whose_origin_is_at_the_hips_is_as_large_as_one_on_the_floor() 
         texts = {text.get_text() for text in figure.axes[0].texts}
         assert any("floor drawn at -" in text for text in texts) == (one is sunk)
     assert heights[1] == pytest.approx(heights[0], rel=0.1)
+
+
+def test_a_prop_of_one_joint_is_drawn_as_a_dot_in_each_cell() -> None:
+    prop = Skeleton(("Prop",), np.array([-1], np.int32), np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    poses = [Clip(prop, 30.0, np.array([[x, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]], np.float32)) for x in (0.0, 0.5)]
+    figure = draw_pose_rows([PoseRow("prop", "", poses)], ["frame 0", "frame 1"], ["0 s", "1 s"])
+    dots = [patch for patch in figure.axes[0].get_children() if isinstance(patch, Circle)]
+    assert len(dots) == 2
+    assert dots[1].center[0] - dots[0].center[0] == pytest.approx(POSE_CELL_IN[0])
+    assert not cut_off(figure)
