@@ -15,6 +15,7 @@ from marey_client.handles.models import ModelHandle
 from marey_client.items import ItemHandle
 from marey_client.poses.kinematics import read_rig
 from marey_client.poses.packing import pack_motion
+from marey_client.poses.strips import ClipOfStrip
 from marey_client.transport import Transport
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
@@ -85,25 +86,24 @@ def motions_of_clips(clips: Sequence[tuple[ClipHandle, int | None]], frames: sli
     `frames` counts in frames of the first clip; of every other clip, the frames at the same times are read. If two
     clips have the same path, the names contain the revisions.
     """
-    leader = clips[0][0]
-    paths = [clip.path for clip, _ in clips]
+    shown = [ClipOfStrip(clip, revision) for clip, revision in clips]
+    paths = [one.clip.path for one in shown]
     return [
-        _read_clip(clip, revision, _at_times_of(leader, clip, frames), with_revision=paths.count(clip.path) > 1)
-        for clip, revision in clips
+        _read_clip(one, _at_times_of(shown[0], one, frames), with_revision=paths.count(one.clip.path) > 1)
+        for one in shown
     ]
 
 
-def _at_times_of(leader: ClipHandle, clip: ClipHandle, frames: slice | None) -> slice | None:
-    if frames is None or clip is leader:
+def _at_times_of(leader: ClipOfStrip, other: ClipOfStrip, frames: slice | None) -> slice | None:
+    if frames is None or other is leader:
         return frames
-    ratio = clip.frame_rate_hz / leader.frame_rate_hz
+    ratio = other.frame_rate_hz / leader.frame_rate_hz
     return slice(*(None if one is None else round(one * ratio) for one in (frames.start, frames.stop)))
 
 
-def _read_clip(clip: ClipHandle, revision: int | None, frames: slice | None, *, with_revision: bool) -> ShownMotion:
-    number = revision or clip.item.revision
-    name = f"{clip.path}, revision {number}" if with_revision else clip.path
-    return shown_motion(clip, name, clip.motion(frames=frames, revision=number))
+def _read_clip(one: ClipOfStrip, frames: slice | None, *, with_revision: bool) -> ShownMotion:
+    name = f"{one.clip.path}, revision {one.number}" if with_revision else one.clip.path
+    return shown_motion(one.clip, name, one.clip.motion(frames=frames, revision=one.number))
 
 
 def motions_of_samples(model: ModelHandle, revision: int | None, n: int, seed: int) -> list[ShownMotion]:

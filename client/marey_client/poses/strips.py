@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ class ClipOfStrip:
 
     def chosen(self, moments: int) -> list[int]:
         """Return the numbers of `moments` frames, evenly spaced over the range."""
-        return _spread(range(*(self.frames or slice(None)).indices(self._count)), moments, self.clip.path)
+        return _spread(range(*(self.frames or slice(None)).indices(self.frame_count)), moments, self.clip.path)
 
     def poses(self, frames: Sequence[int]) -> list[Any]:
         """Read single frames, each as a clip of `marey_motion`."""
@@ -56,8 +57,8 @@ class ClipOfStrip:
 
     def at_times_of(self, other: ClipOfStrip, frames: Sequence[int]) -> list[int]:
         """Return the frames of this clip at the times of `frames` of another clip; times after the end are left out."""
-        ratio = self.clip.frame_rate_hz / other.clip.frame_rate_hz
-        found = [frame for frame in (round(one * ratio) for one in frames) if frame < self._count]
+        ratio = self.frame_rate_hz / other.frame_rate_hz
+        found = [frame for frame in (round(one * ratio) for one in frames) if frame < self.frame_count]
         if not found:
             raise BadArgument(
                 f"frames: {self.clip.path!r} ends before the time of the first frame; choose earlier frames"
@@ -72,10 +73,21 @@ class ClipOfStrip:
         return _posed(motion, read_rig(self.clip, reference))
 
     @property
-    def _count(self) -> int:
+    def frame_count(self) -> int:
+        """The number of frames of the revision."""
+        return self._length[0]
+
+    @property
+    def frame_rate_hz(self) -> float:
+        """The frames per second of the revision, which can differ from those of the newest revision."""
+        return self._length[1]
+
+    @cached_property
+    def _length(self) -> tuple[int, float]:
         if self.number == self.clip.item.revision:
-            return self.clip.frames
-        return len(self.clip.motion(revision=self.number).poses)
+            return self.clip.frames, self.clip.frame_rate_hz
+        motion = self.clip.motion(revision=self.number)  # the summaries of earlier revisions are not stored
+        return len(motion.poses), motion.frame_rate_hz
 
 
 def draw_clips(first: ClipOfStrip, second: ClipOfStrip | None, moments: int, file_type: str) -> bytes:
@@ -100,7 +112,7 @@ def draw_clips(first: ClipOfStrip, second: ClipOfStrip | None, moments: int, fil
             strips.PoseRow(first.clip.name, f"revision {first.number}", poses),
             strips.PoseRow(second.clip.name, f"revision {second.number}", others, ghost=poses if same_clip else ()),
         ]
-    labels = [f"{frame / first.clip.frame_rate_hz:.2f} s" for frame in frames]
+    labels = [f"{frame / first.frame_rate_hz:.2f} s" for frame in frames]
     ghost = f"revision {first.number}" if same_clip else ""
     figure = strips.draw_pose_rows(rows, [f"frame {frame}" for frame in frames], labels, ghost=ghost)
     return _written(figure, file_type, first.clip.path)
@@ -196,7 +208,7 @@ class DisplayedFrames:
         self._evaluation = evaluation
         self._clips = document["clips"]
         self._starts = [one["start"] for one in self._clips]
-        self._handles: dict[str, ClipHandle] = {}
+        self._recordings: dict[tuple[str, int], ClipOfStrip] = {}
 
     def pose(self, row: int) -> Any:
         """Return the recorded pose of a row of the database as a clip of one frame, mirrored if the row is mirrored."""
@@ -208,17 +220,18 @@ class DisplayedFrames:
         """Return the frame of the recorded clip that corresponds to a row of the database."""
         found = self._clips[int(np.searchsorted(self._starts, row, side="right")) - 1]
         item, _, revision = found["uid"].partition("~")[0].partition("@")  # of a mirrored copy, more follows
-        clip = self._clip(item)
+        recorded = self._recording(item, int(revision))
         time_s = found["first_s"] + (row - found["start"]) / self.rate_hz
-        frame = min(round(time_s * clip.frame_rate_hz), clip.frames - 1)
-        return RecordedFrame(clip, int(revision), frame, found["mirrored_from"] is not None)
+        frame = min(round(time_s * recorded.frame_rate_hz), recorded.frame_count - 1)
+        return RecordedFrame(recorded.clip, recorded.number, frame, found["mirrored_from"] is not None)
 
-    def _clip(self, item: str) -> ClipHandle:
-        if item not in self._handles:
+    def _recording(self, item: str, revision: int) -> ClipOfStrip:
+        if (item, revision) not in self._recordings:
             path = f"/projects/{self._evaluation.project}/{Kind.CLIP.plural}/{item}"
             found = self._evaluation.transport.get(type(self._evaluation.item), path)
-            self._handles[item] = ClipHandle(self._evaluation.transport, self._evaluation.project, found)
-        return self._handles[item]
+            clip = ClipHandle(self._evaluation.transport, self._evaluation.project, found)
+            self._recordings[item, revision] = ClipOfStrip(clip, revision)
+        return self._recordings[item, revision]
 
 
 def mirrored(clip: Any) -> Any:
