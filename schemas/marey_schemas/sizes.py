@@ -14,6 +14,8 @@ GIB = 1024 * MIB
 DAY_S = 86400
 MOST_INTEGER = 2**31 - 1
 """Greatest number of a revision or of a frame, the greatest that an INTEGER column of Postgres stores."""
+MOST_QUERY_VALUES = 256
+"""Greatest number of values in a comma-separated query parameter."""
 SEEDS = 2**63
 """Number of different seeds, the integers from 0 on."""
 LOGIN_DAYS, LONGEST_LOGIN_DAYS = 7, 90

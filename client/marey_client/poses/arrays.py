@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 
 from marey_client.arguments import checks_arguments, several
-from marey_client.errors import BadArgument
+from marey_client.errors import BadArgument, NoSuchJoint
 from marey_client.items import ItemHandle
 from marey_schemas.documents.clips import MotionDocument
+from marey_schemas.sizes import MOST_QUERY_VALUES
 
 
 class MotionArrays(MotionDocument):
@@ -34,6 +35,9 @@ class MotionArrays(MotionDocument):
         """(frames, joints, 4) local rotations in the order of `joints`."""
         return self.poses[:, 3:].reshape(len(self.poses), -1, 4)
 
+
+LONGEST_NAMES = 4000
+"""Greatest number of characters of names of joints in the address of a request; proxies refuse long addresses."""
 
 Joints = str | Sequence[str] | None
 """One joint or several, by name; None: all joints."""
@@ -67,8 +71,11 @@ class PosedItem(ItemHandle):
         self, *, frames: slice | None = None, joints: Joints = None, revision: int | None = None
     ) -> MotionArrays:
         """Return the poses as numpy arrays, by default those of the newest revision."""
-        query = {"frames": frames_text(frames), "joints": ",".join(several(joints)) if joints is not None else None}
-        return MotionArrays.model_validate(self.part("motion", revision=revision, **query))
+        names = None if joints is None else several(joints)
+        asked = None if names is None or not _fit_query(names) else ",".join(names)
+        query = {"frames": frames_text(frames), "joints": asked}
+        found = MotionArrays.model_validate(self.part("motion", revision=revision, **query))
+        return found if names is None or asked is not None else _only_joints(found, names)
 
     def joints(self) -> tuple[str, ...]:
         """Return the names of the joints, in the order of the arrays."""
@@ -77,6 +84,34 @@ class PosedItem(ItemHandle):
     def rotations(self, *, joints: Joints = None, frames: slice | None = None) -> NDArray[np.float32]:
         """Return the local rotations of joints: (frames, joints, 4), unit quaternions w, x, y, z."""
         return self.motion(frames=frames, joints=joints, revision=self.item.revision).rotations
+
+
+def _fit_query(names: Sequence[str]) -> bool:
+    """Return whether a request can name these joints; their number, a comma or the length of the address may forbid it.
+
+    If it cannot, all joints are requested.
+    """
+    return len(names) <= MOST_QUERY_VALUES and len("".join(names)) <= LONGEST_NAMES and "," not in "".join(names)
+
+
+def _only_joints(motion: MotionArrays, names: Sequence[str]) -> MotionArrays:
+    """Return some joints of a motion, in the order of `names`; the translation of the root is always kept."""
+    places = {name: place for place, name in enumerate(motion.joints)}
+    if unknown := [name for name in names if name not in places]:
+        raise NoSuchJoint(f"the motion has no joint {unknown[0]!r}; `joints()` returns the names of all joints")
+    if len(set(names)) != len(names):
+        raise BadArgument("joints: give no joint twice")
+    turns = motion.rotations[:, [places[name] for name in names]].reshape(len(motion.poses), -1)
+    kept = [place for place, name in enumerate(motion.translated_joints) if name in set(names)]
+    moved = motion.translations
+    return motion.model_copy(
+        update={
+            "joints": tuple(names),
+            "poses": np.concatenate((motion.root_translations, turns), axis=1),
+            "translated_joints": tuple(motion.translated_joints[place] for place in kept),
+            "translations": moved[:, kept] if moved is not None and kept else None,
+        }
+    )
 
 
 def frames_text(frames: slice | None) -> str | None:

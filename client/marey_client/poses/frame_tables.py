@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from marey_client.arguments import several
+from marey_client.errors import BadArgument
 from marey_client.extras import import_optional
 from marey_client.listing.tables import TABLES_EXTRA
 from marey_client.poses.arrays import Joints, PosedItem
 from marey_client.poses.kinematics import read_positions
 
 AXES = ("x", "y", "z")
+FACT_COLUMNS = ("frame", "time_s")
+"""Columns of tables of pyarrow that are not joints."""
 
 
 def to_dataframe(clip: PosedItem, joints: Joints, frames: slice | None) -> Any:
@@ -33,6 +36,11 @@ def to_arrow(clip: PosedItem, joints: Joints, frames: slice | None) -> Any:
     """Return positions as a table of pyarrow, with one column of three numbers for each joint."""
     arrow = import_optional("pyarrow", TABLES_EXTRA)
     names, positions = _named_positions(clip, joints, frames)
+    if taken := [name for name in names if name in FACT_COLUMNS]:
+        raise BadArgument(
+            f"joints: the joint {taken[0]!r} has the name of another column of the table; leave it out, or use "
+            "to_dataframe, whose columns are pairs of joint and axis"
+        )
     first = _first(frames)
     columns = {
         "frame": arrow.array(np.arange(first, first + len(positions))),

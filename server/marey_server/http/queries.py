@@ -8,18 +8,17 @@ from pydantic import BeforeValidator, Field, StringConstraints
 
 from marey_schemas.base import Request
 from marey_schemas.names import form
+from marey_schemas.sizes import MOST_QUERY_VALUES
 from marey_server.store.listing import DEFAULT_LIMIT, MAX_LIMIT
 
 T = TypeVar("T")
-
-MAX_VALUES = 256
 
 
 def _split(value: Any) -> Any:
     return tuple(value.split(",")) if isinstance(value, str) else value
 
 
-CommaSeparatedOf = Annotated[tuple[T, ...], Field(max_length=MAX_VALUES), BeforeValidator(_split)]
+CommaSeparatedOf = Annotated[tuple[T, ...], Field(max_length=MOST_QUERY_VALUES), BeforeValidator(_split)]
 """List of values in one parameter, separated by commas."""
 
 CommaSeparated = CommaSeparatedOf[Annotated[str, StringConstraints(max_length=1024)]]
