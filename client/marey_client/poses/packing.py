@@ -2,7 +2,7 @@
 
 Rotations become rotation vectors of 15 bits per component, and lengths become multiples of `LENGTH_STEP_M`. Each
 channel is stored as differences between frames, in byte planes, deflated. The greatest error is 0.01 degrees per
-joint, and 0.025 mm per axis of the root.
+joint, and 0.025 mm per axis of the root, if the root stays within 100 km of the origin.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ ANGLE_STEP_RAD = math.pi / 16383
 """Quantisation step of rotation vectors, whose components are at most pi. The error of a rotation is at most
 sqrt(3) / 2 steps, because the angle between two rotations is at most the length of the difference of their vectors."""
 LENGTH_STEP_M = 5e-5
+"""Usual quantisation step of lengths; lengths beyond 100 km, such as geographical ones, need a greater step."""
+_GREATEST_STEPS = 2**31 - 1
 _ANGLE_BYTES = 2
 _LENGTH_BYTES = 4
 
@@ -33,15 +35,16 @@ def pack_motion(motion: MotionDocument) -> dict[str, Any]:
     lengths = (
         motion.poses[:, :3] if moved is None else np.concatenate((motion.poses[:, :3], moved.reshape(frames, -1)), 1)
     )
+    step_m = max(LENGTH_STEP_M, float(np.abs(lengths).max(initial=0.0)) / _GREATEST_STEPS)
     return {
         "frame_rate_hz": motion.frame_rate_hz,
         "frames": frames,
         "joints": list(motion.joints),
         "translated_joints": list(motion.translated_joints),
         "angle_step_rad": ANGLE_STEP_RAD,
-        "length_step_m": LENGTH_STEP_M,
+        "length_step_m": step_m,
         "rotations": _packed(rotation_vectors(rotations).reshape(frames, -1) / ANGLE_STEP_RAD, _ANGLE_BYTES),
-        "lengths": _packed(lengths.astype(np.float64) / LENGTH_STEP_M, _LENGTH_BYTES),
+        "lengths": _packed(lengths.astype(np.float64) / step_m, _LENGTH_BYTES),
     }
 
 

@@ -2,6 +2,8 @@
 
 import json
 import re
+import zlib
+from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +70,17 @@ def test_rounding_turns_no_joint_by_more_than_the_documented_angle() -> None:
     short = np.minimum(np.linalg.norm(again - turned, axis=-1), np.linalg.norm(again + turned, axis=-1))
     assert np.degrees(4 * np.arcsin(short / 2)).max() < MOST_ERROR_DEG
     assert LENGTH_STEP_M / 2 == 25e-6
+
+
+def test_a_root_far_from_the_origin_is_packed_with_a_greater_step() -> None:
+    motion = a_motion()
+    far = motion.poses.copy()
+    far[:, 2] += 5.4e6  # metres to the equator, as in geographical coordinates
+    packed = pack_motion(motion.model_copy(update={"poses": far}))
+    planes = np.frombuffer(zlib.decompress(b64decode(packed["lengths"])), np.uint8).reshape(4, -1).T
+    folded = np.ascontiguousarray(planes).view("<u4").reshape(3, -1).astype(np.int64)
+    again = np.cumsum((folded >> 1) ^ -(folded & 1), axis=1) * packed["length_step_m"]
+    np.testing.assert_allclose(again.T, far[:, :3], atol=packed["length_step_m"])
 
 
 @pytest.mark.parametrize("rate_hz", [30.0, 120.0])
