@@ -14,6 +14,8 @@ NAMES_SHOWN = 5
 """Greatest number of names that a message lists."""
 _WITH_CHOICES = re.compile(r"^('.*' is not one of ((?:'[^']*'(?:, )?)+))\.$")
 """Pattern of typer's messages about options with choices."""
+_FORMULA_SIGNS = tuple("=+-@\t\r")
+"""Characters at the beginning of a text that make a spreadsheet read the text as a formula."""
 _QUOTED = re.compile(r"'([^']*)'")
 
 
@@ -211,3 +213,11 @@ def printable(text: str) -> str:
     Many texts contain parts that other users wrote, and these must not control the terminal of the reader.
     """
     return "".join(one if one.isprintable() or one == "\n" else ascii(one)[1:-1] for one in text)
+
+
+def without_formula(text: str) -> str:
+    """Return a text for a cell of a CSV table, with an apostrophe before a text that looks like a formula.
+
+    Many texts in tables are names that other users wrote, and these must not compute anything in a spreadsheet.
+    """
+    return f"'{text}" if text.startswith(_FORMULA_SIGNS) else text

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from marey_reports.drawing.paper import to_png, to_svg
+from marey_schemas.wording import without_formula
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -105,9 +106,13 @@ def _plain(value: Any) -> Any:
 
 
 def as_csv(columns: Mapping[str, Column]) -> str:
-    """Write a table as CSV with a header and LF at line ends; numbers are as short as possible, but exact."""
+    """Write a table as CSV with a header and LF at line ends; numbers are as short as possible, but exact.
+
+    Texts that look like formulas get an apostrophe, because people open the tables with spreadsheets.
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*(listed(values) for values in columns.values()), strict=True))
+    writer.writerow(map(without_formula, columns))
+    rows = zip(*(listed(values) for values in columns.values()), strict=True)
+    writer.writerows([without_formula(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)
     return buffer.getvalue()

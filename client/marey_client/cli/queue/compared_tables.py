@@ -7,14 +7,14 @@ import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from marey_schemas.wording import without_formula
+
 if TYPE_CHECKING:
     from marey_schemas.queue.comparisons import ComparedColumn, RunComparison
     from marey_schemas.queue.scripts import Value
 
 BEST = " *"
 """Text that follows the best value of a column."""
-FORMULA_SIGNS = tuple("=+-@\t\r")
-"""Characters at the beginning of a text that make a spreadsheet read the text as a formula."""
 
 
 class RunTable(NamedTuple):
@@ -121,4 +121,4 @@ def _short(cell: Value | None) -> str:
 def _safe(cell: Value | None) -> Value | None:
     if isinstance(cell, bool):
         return str(cell).lower()
-    return f"'{cell}" if isinstance(cell, str) and cell.startswith(FORMULA_SIGNS) else cell
+    return without_formula(cell) if isinstance(cell, str) else cell
