@@ -54,6 +54,25 @@ def test_a_graph_that_was_written_is_read_as_the_same_and_begins_under_both_name
     assert json.loads(write_predecessor_graph(graph_of_document(written, "again.json"))) == written
 
 
+def test_a_name_that_is_the_id_of_another_node_leads_to_no_other_node() -> None:
+    document = {
+        "nodes": {
+            "walk": {
+                "1": {"name": "2", "transitions": {"walk:2": {"action_name": "walk", "model_name": "2"}}},
+                "2": {"name": "1", "transitions": transition("walk", "2", 1)},
+            }
+        },
+        "start_node": ["walk", "2"],
+    }
+    graph = graph_of_document(document, "g.json")
+    assert graph.start == ("walk", "2")
+    assert {place: node.transitions for place, node in graph.nodes.items()} == {
+        ("walk", "2"): (("walk", "2"),),
+        ("walk", "1"): (("walk", "2"),),
+    }
+    assert graph_of_document(json.loads(write_predecessor_graph(graph)), "again.json") == graph
+
+
 def test_a_graph_without_a_start_is_refused_by_the_field_that_is_missing() -> None:
     with pytest.raises(FormatError, match="'start_node' is missing") as refused:
         graph_of_document({"nodes": DOCUMENT["nodes"]}, "g.json")

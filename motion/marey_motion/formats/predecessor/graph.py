@@ -91,7 +91,7 @@ def graph_of_document(document: Mapping[str, Any], file: str) -> PredecessorGrap
             places.add(place)
             listed[action, model_id] = node
             names[action, model_id] = place
-    known = {**{place: place for place in names.values()}, **names}
+    known = _Known(names, {place: place for place in places})
     found = {
         names[key]: GraphNode(key[1], _type(node, names[key], file), _transitions(node, names[key], known, file))
         for key, node in listed.items()
@@ -131,6 +131,22 @@ def write_predecessor_graph(graph: PredecessorGraph, *, encoding: Encoding = "js
     return encode_document({"nodes": nodes, "start_node": start, "startNode": start}, encoding)
 
 
+@dataclass(frozen=True)
+class _Known:
+    """Nodes by action and id of the model, and by action and name; a name may equal the id of another node."""
+
+    by_id: Mapping[tuple[str, str], Place]
+    by_name: Mapping[tuple[str, str], Place]
+
+    def with_id(self, key: tuple[str, str]) -> Place | None:
+        """Return the node with an id, else the node with this name, else None."""
+        return self.by_id.get(key) or self.by_name.get(key)
+
+    def with_name(self, key: tuple[str, str]) -> Place | None:
+        """Return the node with a name, else the node with this id, else None."""
+        return self.by_name.get(key) or self.by_id.get(key)
+
+
 def _type(node: Mapping[str, Any], place: Place, file: str) -> str:
     kind = node.get("type", "standard")
     if kind not in NODE_TYPES:
@@ -141,7 +157,7 @@ def _type(node: Mapping[str, Any], place: Place, file: str) -> str:
 
 
 def _transitions(
-    node: Mapping[str, Any], place: Place, known: Mapping[tuple[str, str], Place], file: str
+    node: Mapping[str, Any], place: Place, known: _Known, file: str
 ) -> tuple[Place, ...]:
     given = node.get("transitions", {})
     if not isinstance(given, Mapping):
@@ -151,8 +167,11 @@ def _transitions(
         action, _, model = key.rpartition(":")
         wanted = target if isinstance(target, Mapping) else {}
         action = str(wanted.get("action_name", action))
-        candidates = [(action, str(one)) for one in (wanted.get("model_id"), wanted.get("model_name"), model) if one]
-        other = next((known[one] for one in candidates if one in known), None)
+        other = (
+            known.with_id((action, str(wanted.get("model_id", ""))))
+            or known.with_name((action, str(wanted.get("model_name", ""))))
+            or known.with_id((action, model))
+        )
         if other is None:
             raise FormatError(
                 f"{'/'.join(place)}: a transition leads to the node {key!r}, which does not exist", file=file
@@ -161,7 +180,7 @@ def _transitions(
     return tuple(dict.fromkeys(found))
 
 
-def _start(document: Mapping[str, Any], known: Mapping[tuple[str, str], Place], file: str) -> Place:
+def _start(document: Mapping[str, Any], known: _Known, file: str) -> Place:
     name = next((name for name in START_FIELDS if name in document), None)
     if name is None:
         raise FormatError(
@@ -170,7 +189,7 @@ def _start(document: Mapping[str, Any], known: Mapping[tuple[str, str], Place], 
     given = document[name]
     if not isinstance(given, list) or len(given) != 2:
         raise FormatError(f"field {name!r} must be a list of two names: an action and a model", file=file)
-    start = known.get((str(given[0]), str(given[1])))
+    start = known.with_name((str(given[0]), str(given[1])))  # as the predecessor's loader reads it
     if start is None:
         raise FormatError(f"field {name!r} refers to the node {given!r}, which does not exist", file=file)
     return start
