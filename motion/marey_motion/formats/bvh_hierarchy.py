@@ -21,6 +21,7 @@ from marey_schemas.lru import LruCache
 CHANNELS = tuple(f"{axis}{kind}" for kind in ("position", "rotation") for axis in "XYZ")
 _CHANNEL_BY_KEY = {name.lower().encode(): name for name in CHANNELS}
 _FRAMES = re.compile(rb"frames\s*(?::\s*)?(\S+)", re.IGNORECASE)
+_NO_VALUE = re.compile(rb"(frames|frame\s*time)\s*:", re.IGNORECASE)
 _FRAME_TIME = re.compile(rb"frame\s*time\s*(?::\s*)?(\S+)", re.IGNORECASE)
 _BRACES = re.compile(rb"([{}])")
 _END_SITE = -1
@@ -244,6 +245,8 @@ def _read_motion_header(lines: TextLines, header: BvhHeader) -> None:
             raise lines.error(
                 "the file ends before 'Frames:' and 'Frame Time:'; copy or export it again", code="file-truncated"
             )
+        if match := _NO_VALUE.fullmatch(line):
+            raise lines.error(f"{excerpt(match[1])}: the number is missing after the colon", code="bad-number")
         if match := _FRAME_TIME.fullmatch(line):
             frame_time = lines.number_in(match[1], "Frame Time")
         elif match := _FRAMES.fullmatch(line):

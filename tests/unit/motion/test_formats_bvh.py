@@ -229,6 +229,11 @@ class TestFrames:
         for frame_time in ("0", "30"):
             assert read(bvh(frame_time=frame_time), frame_rate_hz=25.0).frame_rate_hz == 25.0
 
+    @pytest.mark.parametrize("name", ["Frame Time", "Frames"])
+    def test_a_missing_number_is_not_taken_for_a_colon(self, name: str) -> None:
+        data = re.sub(rf"{name}:.*".encode(), f"{name}: ".encode(), bvh())
+        assert f"{name}: the number is missing after the colon" in str(refusal(data))
+
     def test_a_file_without_a_frame_time_is_read_at_the_rate_the_user_gives(self) -> None:
         data = bvh([ROW, "", ROW]).replace(b"Frame Time: 0.01\n", b"\n")
         source = read(data, frame_rate_hz=25.0)
