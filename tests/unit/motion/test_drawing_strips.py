@@ -188,5 +188,6 @@ def test_a_prop_of_one_joint_is_drawn_as_a_dot_in_each_cell() -> None:
     figure = draw_pose_rows([PoseRow("prop", "", poses)], ["frame 0", "frame 1"], ["0 s", "1 s"])
     dots = [patch for patch in figure.axes[0].get_children() if isinstance(patch, Circle)]
     assert len(dots) == 2
-    assert dots[1].center[0] - dots[0].center[0] == pytest.approx(POSE_CELL_IN[0])
+    lefts = [dot.get_extents().x0 / figure.dpi for dot in dots]
+    assert lefts[1] - lefts[0] == pytest.approx(POSE_CELL_IN[0])
     assert not cut_off(figure)
