@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import threading
 import unicodedata
 import uuid
@@ -13,6 +14,7 @@ from email.message import Message
 from email.utils import collapse_rfc2231_value
 from io import BufferedRandom
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from marey_client.transport import Params, Transport
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
     import httpx
 
 _NOT_IN_A_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]+')
+_DEVICE_FOLDERS = (Path("/dev"), Path("/dev/fd"))
+"""Folders with links to open files, which a renamed file would replace for all programs of the machine."""
 LONGEST_NAME_BYTES = 240
 """Greatest length of a file name in bytes; file systems allow 255, so a number can still be added to the name."""
 LONGEST_ENDING = 16
@@ -28,8 +32,17 @@ LONGEST_ENDING = 16
 
 @contextmanager
 def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
-    """Yield a temporary file; rename it to `target` at the end of the `with` block, or delete it if the block fails."""
+    """Yield a temporary file; rename it to `target` at the end of the `with` block, or delete it if the block fails.
+
+    The temporary file of a pipe or a device, such as /dev/stdout, is copied to `target` instead.
+    """
     target = Path(target)
+    if target.is_fifo() or target.is_char_device() or target.parent in _DEVICE_FOLDERS:
+        with TemporaryFile("w+b") as file, target.open("wb") as stream:
+            yield file
+            file.seek(0)
+            shutil.copyfileobj(file, stream)
+        return
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name[:32]}.{uuid.uuid4().hex}")
     try:
@@ -43,6 +56,12 @@ def saved_atomically(target: str | Path) -> Iterator[BufferedRandom]:
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(target)  # a disk that is full does not say where
         raise
+
+
+def write_whole(target: str | Path, content: bytes | str) -> None:
+    """Write a file, and the folders that it needs; if this fails, an earlier file at `target` stays as it was."""
+    with saved_atomically(target) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 def safe_file_name(name: str, ending: str = "") -> str:

@@ -85,8 +85,10 @@ def suggest(
         if out is not None:
             found.save_report(out)
     if remove_out is not None:
+        from marey_client.downloads import write_whole
+
         names = [f"{clip['name']}\n" for clip in document["unused"]["clips"]]
-        remove_out.write_text("".join(names), encoding="utf-8")
+        write_whole(remove_out, "".join(names))
         print_message(f"{counted(len(names), 'clip')} that can be removed: {remove_out}")
     print_findings(found, document, as_json, _print_suggestions)
     if out is not None and not as_json:

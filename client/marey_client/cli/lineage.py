@@ -52,8 +52,9 @@ def lineage(
 
 def _draw(graph: LineageGraph, picture: Path) -> None:
     from marey_client import embedded
+    from marey_client.downloads import write_whole
 
-    picture.write_bytes(embedded.draw_lineage(graph, picture.suffix.lower().lstrip(".")))
+    write_whole(picture, embedded.draw_lineage(graph, picture.suffix.lower().lstrip(".")))
     print_message(f"wrote {picture}")
 
 

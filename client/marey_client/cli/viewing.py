@@ -221,7 +221,9 @@ class Drawing:
         return file_type
 
     def _write(self, data: bytes) -> Path:
-        self.out.write_bytes(data)
+        from marey_client.downloads import write_whole
+
+        write_whole(self.out, data)
         return self.out
 
 

@@ -1,6 +1,7 @@
 """Downloaded files and their names on disk."""
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,11 @@ import httpx
 import pytest
 from tests.support.scripted_server import ScriptedServer
 
-from marey_client.downloads import TakenPaths, download, safe_file_name
+from marey_client import embedded
+from marey_client.cli import lineage
+from marey_client.cli.viewing import Drawing
+from marey_client.downloads import TakenPaths, download, safe_file_name, write_whole
+from marey_client.poses import strips
 from marey_server.http.streaming import attachment
 
 
@@ -73,3 +78,42 @@ def test_a_download_that_is_tried_again_keeps_its_name_and_replaces_an_older_fil
     assert fetch(script, tmp_path) == tmp_path / "walk.bvh"
     assert (tmp_path / "walk.bvh").read_bytes() == b"motion"
     assert [path.name for path in tmp_path.iterdir()] == ["walk.bvh"]
+
+
+def draw_clips(target: Path) -> None:
+    clip: Any = None
+    Drawing(target, 1, 1, 0).of_clips([(clip, 1)], None)
+
+
+def draw_lineage(target: Path) -> None:
+    graph: Any = None
+    lineage._draw(graph, target)
+
+
+@pytest.mark.parametrize("draw", [draw_clips, draw_lineage])
+def test_a_picture_is_written_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, draw: Callable[[Path], None]
+) -> None:
+    target = tmp_path / "new folder" / "picture.svg"
+    monkeypatch.setattr(strips, "draw_clips", lambda *_: b"first")
+    monkeypatch.setattr(embedded, "draw_lineage", lambda *_: b"first")
+    draw(target)
+    assert target.read_bytes() == b"first"
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        draw(target)
+    assert [(path, path.read_bytes()) for path in target.parent.iterdir()] == [(target, b"first")]
+
+
+def test_a_pipe_gets_the_content_and_stays_a_pipe(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_whole(pipe, "motion")
+    assert os.read(reader, 100) == b"motion"
+    os.close(reader)
+    assert pipe.is_fifo()

@@ -75,8 +75,9 @@ def diff(
 
 def _draw(difference: Difference, picture: Path) -> None:
     from marey_client import embedded
+    from marey_client.downloads import write_whole
 
     if difference.plot is None and difference.annotations is None:
         return print_message("there is nothing to draw; only changed motions and annotations have a picture")
-    picture.write_bytes(embedded.draw_difference(difference, picture.suffix.lower().lstrip(".")))
+    write_whole(picture, embedded.draw_difference(difference, picture.suffix.lower().lstrip(".")))
     return print_message(f"wrote {picture}")

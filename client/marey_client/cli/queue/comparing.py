@@ -137,12 +137,13 @@ def _origin(marey: Marey, project: str) -> ReportOrigin:
 
 def _draw(found: RunComparison, chart: Path, options: dict[str, Any], origin: ReportOrigin | None) -> None:
     from marey_client import embedded
+    from marey_client.downloads import write_whole
     from marey_schemas.documents.report_pages import with_origin
 
     if not found.runs:
         return print_message("there is nothing to draw; no run has succeeded")
     drawn = embedded.draw_comparison(found, **options)
-    chart.write_bytes(drawn if origin is None else with_origin(drawn, origin))
+    write_whole(chart, drawn if origin is None else with_origin(drawn, origin))
     return print_message(f"wrote {chart}")
 
 

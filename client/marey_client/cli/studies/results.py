@@ -55,6 +55,7 @@ def export(
 
     For maintainers and owners of the project.
     """
+    from marey_client.downloads import write_whole
     from marey_client.handles.studies import pairs_csv, trials_csv
 
     with connect(context) as marey:
@@ -63,7 +64,7 @@ def export(
         text = json.dumps([one.model_dump(mode="json") for one in people], indent=1) + "\n"
     else:
         text = (pairs_csv if form is ExportForm.PAIRS else trials_csv)(people)
-    out.write_text(text, encoding="utf-8")
+    write_whole(out, text)
     print_message(f"{out}: {sum(len(one.trials) for one in people):,} trials of {len(people):,} participants")
 
 
