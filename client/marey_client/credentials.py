@@ -22,14 +22,19 @@ from urllib.parse import urlsplit
 import certifi
 
 from marey_client.errors import BadAddress, BadCredentialFile, BadToken
-from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SERVER_VARIABLES, SETTINGS_FILE
+from marey_schemas.address import (
+    ADMIN_TOKEN_FILE,
+    DEFAULT_DATA,
+    DEFAULT_HOST,
+    DEFAULT_PORT,
+    SERVER_VARIABLES,
+    SETTINGS_FILE,
+)
 
 if TYPE_CHECKING:
     import httpx  # takes long to load; completion in a shell needs credentials only
 
 DEFAULT_URL = f"http://{DEFAULT_HOST}:{DEFAULT_PORT}"
-DEFAULT_DATA = "marey-data"
-ADMIN_TOKEN = "admin.token"  # noqa: S105 - the name of a file
 log = logging.getLogger(__name__)
 
 LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -317,7 +322,7 @@ def _local_token_file(url: str, environment: Mapping[str, str]) -> Path | None:
     """Return the path of the administrator's token file of a server on this machine; None if it cannot be read."""
     if urlsplit(url).hostname not in LOOPBACK:
         return None
-    path = Path(environment.get("MAREY_DATA") or _configured_data() or DEFAULT_DATA) / ADMIN_TOKEN
+    path = Path(environment.get("MAREY_DATA") or _configured_data() or DEFAULT_DATA) / ADMIN_TOKEN_FILE
     return path if path.is_file() and os.access(path, os.R_OK) else None
 
 

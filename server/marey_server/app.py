@@ -20,6 +20,7 @@ from tornado.routing import AnyMatches, Rule
 from tornado.web import Application as TornadoApplication
 from tornado.web import RequestHandler
 
+from marey_schemas.address import ADMIN_TOKEN_FILE
 from marey_schemas.processes.environment import clean_environment
 from marey_schemas.processes.memory import keep_freed_memory
 from marey_schemas.sizes import KIB, MIB
@@ -41,7 +42,7 @@ from marey_server.http.resource import Resource
 from marey_server.http.routes import RouteTable
 from marey_server.launchers.pools import keeping_workers
 from marey_server.process import programs
-from marey_server.process.administrators import TOKEN_FILE, make_first_administrator
+from marey_server.process.administrators import make_first_administrator
 from marey_server.process.children import Children
 from marey_server.process.computing import compute_on_one_thread_each
 from marey_server.process.data_folder import BLOB_FOLDER, prepare_data_folder
@@ -262,7 +263,7 @@ def open_database(settings: Settings, *, while_serving: bool = False) -> Databas
         if upgraded.waiting:
             log.info("when all servers have this version, run `marey db upgrade --finish`")
         database = connect_database(settings)
-        database.write(SYSTEM, make_first_administrator, settings.data / TOKEN_FILE)
+        database.write(SYSTEM, make_first_administrator, settings.data / ADMIN_TOKEN_FILE)
     return database
 
 
@@ -385,7 +386,7 @@ def greeting(settings: Settings, address: str, database: Database) -> Iterator[s
     data = settings.data.absolute()
     yield f"data: {data}; database: {database.shown}"
     administrator = database.read(SYSTEM, users.administrator_principal).user_name
-    token_file = data / TOKEN_FILE
+    token_file = data / ADMIN_TOKEN_FILE
     if token_file.is_file():
         yield f"administrator: {administrator}; a token of an administrator is in {token_file}"
     else:
@@ -403,7 +404,7 @@ def next_command(settings: Settings, address: str) -> str:
     usual_address = f"http://{defaults['host'].default}:{defaults['port'].default}"
     if reachable == usual_address and settings.data.absolute() == defaults["data"].default.absolute():
         return f" in this folder: {FIRST_COMMAND}"
-    token_file = settings.data.absolute() / TOKEN_FILE
+    token_file = settings.data.absolute() / ADMIN_TOKEN_FILE
     if not token_file.is_file():
         return f": marey login --server {reachable}"
     program, words = FIRST_COMMAND.split(" ", 1)

@@ -22,7 +22,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_settings.exceptions import SettingsError
 
-from marey_schemas.address import SETTINGS_FILE
+from marey_schemas.address import ADMIN_TOKEN_FILE, SETTINGS_FILE
 from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.log_lines import usual_form
 from marey_schemas.wording import counted
@@ -337,13 +337,13 @@ def admin_token(*, user: str | None = None, **settings: Any) -> None:
     from marey_server.access.principal import SYSTEM
     from marey_server.app import connect_database
     from marey_server.errors import NotFoundProblem
-    from marey_server.process.administrators import TOKEN_FILE, give_token
+    from marey_server.process.administrators import give_token
 
     chosen = read_settings(**settings)
     if chosen.database_url is None:
         _sqlite_file(chosen, must_exist=True)
     chosen.data.mkdir(parents=True, exist_ok=True, mode=0o700)
-    file = chosen.data / TOKEN_FILE
+    file = chosen.data / ADMIN_TOKEN_FILE
     with _database_of(chosen), closing(connect_database(chosen)) as database:
         try:
             database.write(SYSTEM, partial(give_token, name="made where the server is"), user, file)

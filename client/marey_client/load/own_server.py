@@ -11,10 +11,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from marey_client.credentials import ADMIN_TOKEN, read_secret
+from marey_client.credentials import read_secret
 from marey_client.errors import MareyError
 from marey_client.marey import Marey
 from marey_client.retries import ONCE
+from marey_schemas.address import ADMIN_TOKEN_FILE
 
 START_S = 60.0
 STOP_S = 40.0
@@ -45,7 +46,7 @@ def own_server(database_url: str | None = None, **settings: str) -> Iterator[Mar
             )  # fmt: skip
         try:
             url = _address(process, folder / "server.log")
-            with Marey(url, read_secret(folder / "data" / ADMIN_TOKEN)) as marey:
+            with Marey(url, read_secret(folder / "data" / ADMIN_TOKEN_FILE)) as marey:
                 yield marey
         finally:
             process.terminate()

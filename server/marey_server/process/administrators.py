@@ -10,8 +10,6 @@ from marey_server.store import users
 from marey_server.store.credentials import tokens
 from marey_server.store.transaction import Transaction
 
-TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
-
 
 def make_first_administrator(tx: Transaction, token_file: Path) -> None:
     """Create the user `admin` in a database without users, and write a token of this user to a file."""

@@ -7,7 +7,7 @@ import os
 import stat
 from pathlib import Path
 
-from marey_server.process.administrators import TOKEN_FILE
+from marey_schemas.address import ADMIN_TOKEN_FILE, SETTINGS_FILE
 from marey_server.process.disk_space import RESERVE_FILE, make_reserve
 from marey_server.process.settings import Settings
 from marey_server.store.database.opening import sqlite_file
@@ -37,7 +37,7 @@ def prepare_data_folder(settings: Settings) -> None:
     folder = settings.data.resolve()
     make_reserve(folder)
     folders = (BLOB_FOLDER, WORKER_CACHE, WORKER_TOKENS, WORKER_LOGS, INDEX_COPIES)
-    own = {folder / name for name in (TOKEN_FILE, *folders, RESERVE_FILE, "marey.toml")}
+    own = {folder / name for name in (ADMIN_TOKEN_FILE, *folders, RESERVE_FILE, SETTINGS_FILE)}
     file = sqlite_file(settings.resolved_database_url)
     if file is not None and file.parent.is_dir():
         os.close(os.open(file, os.O_CREAT | os.O_RDWR, 0o600))

@@ -14,9 +14,9 @@ from typing import Literal, NamedTuple
 from urllib.parse import urlsplit
 
 from marey_motion.warm_up import kernels_are_compiled
+from marey_schemas.address import ADMIN_TOKEN_FILE
 from marey_server.access.principal import SYSTEM
 from marey_server.errors import ApiProblem, UnavailableProblem
-from marey_server.process.administrators import TOKEN_FILE
 from marey_server.process.disk_space import DiskSpace
 from marey_server.process.identity_provider import IdentityProvider
 from marey_server.process.setting_faults import misspelt_variables
@@ -96,7 +96,7 @@ def _check_secrets(settings: Settings, url_in_command: str | None) -> Finding:
         settings.database_password_file,
         settings.s3_secret_key_file,
         settings.oidc_client_secret_file,
-        settings.data / TOKEN_FILE,
+        settings.data / ADMIN_TOKEN_FILE,
     )
     readable = [file for file in files if file is not None and file.is_file() and file.stat().st_mode & 0o007]
     warnings = [f"all users can open {file}; run `chmod o-rwx {file}`." for file in readable]

@@ -10,7 +10,7 @@ from urllib.parse import quote, urlsplit
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
-from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
+from marey_schemas.address import DEFAULT_DATA, DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
 from marey_schemas.names import form
 from marey_schemas.sizes import KIB, MIB
 from marey_server.access.network_addresses import Network, read_network
@@ -41,7 +41,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     )
 
     data: Path = Field(
-        Path("marey-data"), description="Folder of the database file, the administrator's token, and blobs."
+        Path(DEFAULT_DATA), description="Folder of the database file, the administrator's token, and blobs."
     )
     host: str = Field(DEFAULT_HOST, min_length=1, description="Address to listen on; 0.0.0.0: all networks.")
     port: int = Field(DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0: any free port.")

@@ -16,8 +16,8 @@ import typer
 from marey_client.cli.demo.evaluation import DemoEvaluation
 from marey_client.cli.demo.versions import DATASET, DemoVersion
 from marey_client.cli.terminal.output import print_message, print_rows
-from marey_client.credentials import ADMIN_TOKEN
 from marey_client.imports import refusal_text
+from marey_schemas.address import ADMIN_TOKEN_FILE
 from marey_schemas.imports import ImportEntry
 from marey_schemas.items import Item
 from marey_schemas.queue.jobs import Job
@@ -113,7 +113,7 @@ def print_report(report: DemoReport) -> None:
     if report.evaluation.report:
         print_message(f"evaluation        {report.evaluation.report.absolute()}")
     marey, data = _command(), shlex.quote(str(report.data))
-    token = shlex.quote(str(report.data / ADMIN_TOKEN))
+    token = shlex.quote(str(report.data / ADMIN_TOKEN_FILE))
     print_message(f"to browse, run    {marey} serve --data {data}   and   {marey} ls demo --token-file {token}")
 
 

@@ -18,7 +18,7 @@ from marey_client.cli.demo.evaluation import evaluate_locomotion
 from marey_client.cli.demo.report import DemoReport, print_report
 from marey_client.cli.demo.versions import version_results
 from marey_client.cli.terminal.output import print_json, print_message
-from marey_client.credentials import ADMIN_TOKEN, read_secret
+from marey_client.credentials import read_secret
 from marey_client.errors import NotFound
 from marey_client.extras import import_optional
 from marey_client.handles.clips import ClipHandle
@@ -29,6 +29,7 @@ from marey_client.marey import Marey
 from marey_client.progress import Advance, progress
 from marey_client.project import ProjectHandle
 from marey_schemas.access import ProjectCreate
+from marey_schemas.address import ADMIN_TOKEN_FILE
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry
 from marey_schemas.options.imports import ImportOptions
@@ -42,7 +43,7 @@ SHEET_TAKES = 8
 def demonstrate(motion: Path | None, *, data: Path, keep_serving: bool, as_json: bool) -> None:
     """Run the demonstration; a second run with the same folder `data` reuses the results of the first run."""
     os.environ.setdefault("MAREY_LOG_LEVEL", "warning")
-    with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN)) as marey:
+    with embedded.server_in_thread(data, workers=1) as url, Marey(url, read_secret(data / ADMIN_TOKEN_FILE)) as marey:
         files = find_files([motion]) if motion else _generated_takes(data / "generated")
         with progress() as advance:
             report = Story(_demo_project(marey), files, data, advance).run()
@@ -226,7 +227,7 @@ def _evenly(clips: Sequence[ClipHandle], most: int) -> list[ClipHandle]:
 
 
 def _serve_on(url: str, data: Path) -> None:
-    print_message(f"serving at {url}; the administrator's token is in {data / ADMIN_TOKEN}; stop with Ctrl-C")
+    print_message(f"serving at {url}; the administrator's token is in {data / ADMIN_TOKEN_FILE}; stop with Ctrl-C")
     try:
         while True:
             time.sleep(3600)
