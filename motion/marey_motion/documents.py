@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from marey_motion.clip import Clip
 from marey_motion.editing.annotations.layers import Keyframe, Layer, Segment
 from marey_motion.errors import ClipError, MappingError
-from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping
+from marey_motion.rigs import STANDARD_JOINTS, JointAxes, JointMapping, map_joints, require_trust
 from marey_motion.skeleton import EndSite, Skeleton
 from marey_schemas.documents import annotations as annotation_documents
 from marey_schemas.documents import clips, skeletons
@@ -280,6 +280,30 @@ def mapping_from_document(
         document.rig, dict(document.joints), document.confidence, document.method, tuple(document.notes)
     )
     return mapping, axes
+
+
+def trusted_mapping(
+    document: skeletons.SkeletonMapping | None, skeleton: Skeleton
+) -> tuple[JointMapping, dict[str, JointAxes]]:
+    """Convert a `mapping` document as `mapping_from_document` does; find the standard joints if there is no document.
+
+    Parameters
+    ----------
+    document : SkeletonMapping or None    the document; None if the skeleton has no part `mapping`
+    skeleton : Skeleton    the skeleton whose joints are mapped
+
+    Returns
+    -------
+    mapping : JointMapping    joint names by standard name
+    axes : dict of str to JointAxes    axes by joint name; empty if there is no document
+
+    Raises
+    ------
+    MappingError    if the document contradicts the skeleton, or if the confidence of the mapping is below
+        `LEAST_CONFIDENCE`
+    """
+    mapping, axes = (map_joints(skeleton), {}) if document is None else mapping_from_document(document, skeleton)
+    return require_trust(mapping), axes
 
 
 def _orthonormal(joint: str, axes: skeletons.JointAxesDocument) -> JointAxes:

@@ -17,6 +17,7 @@ from marey_motion.documents import mapping_to_document, skeleton_to_document
 from marey_motion.gait import generate_gait
 from marey_motion.rigs import guess_axes, map_joints
 from marey_schemas.access import Role
+from marey_schemas.documents.skeletons import SkeletonMapping
 from marey_schemas.encoding.codecs import BSON, JSON, MSGPACK, encode_tree
 
 STREAMS = "/projects/lab/coverage-streams"
@@ -212,7 +213,9 @@ def test_an_evaluation_without_a_map_that_makes_sense_is_refused(
 
 def test_a_skeleton_that_tells_no_direction_is_refused(owner: httpx.Client) -> None:
     chain = {"schema": "marey/skeleton@1", "joints": [{"name": "j", "parent": -1, "offset": [0, 1, 0]}]}
-    made = owner.post("/projects/lab/skeletons", json={"name": "chain", "parts": {"hierarchy": chain}})
+    mapping = SkeletonMapping(method="manual", confidence=1.0, joints={"root": "j"})
+    parts = {"hierarchy": chain, "mapping": mapping.model_dump(mode="json", by_alias=True)}
+    made = owner.post("/projects/lab/skeletons", json={"name": "chain", "parts": parts})
     refused = problem(owner.post(STREAMS, json={"frame_rate_hz": 60, "skeleton": made.json()["id"]}), 422)
     assert refused["errors"][0]["pointer"] == "/skeleton"
     assert "ankle" in refused["detail"]
@@ -226,6 +229,20 @@ SENSELESS: list[Any] = [
     ({"frame_rate_hz": 60, "target_count": 17}, "at most 16"),
     ({}, "this field is missing"),
 ]
+
+
+def test_a_skeleton_that_is_hardly_recognised_is_refused(owner: httpx.Client, walk: Clip) -> None:
+    mapping = mapping_to_document(map_joints(walk.skeleton), {}).model_copy(update={"confidence": 0.1})
+    parts = {
+        "hierarchy": skeleton_to_document(walk.skeleton).model_dump(mode="json", by_alias=True),
+        "mapping": mapping.model_dump(mode="json", by_alias=True),
+    }
+    made = owner.post("/projects/lab/skeletons", json={"name": "doubtful", "parts": parts})
+    assert made.status_code == 201, made.text
+    body = {"frame_rate_hz": RATE_HZ, "skeleton": made.json()["id"]}
+    refused = problem(owner.post(STREAMS, json=body), 422)
+    assert (refused["code"], refused["errors"][0]["pointer"]) == ("mapping-uncertain", "/skeleton")
+    assert "marey skeleton map --confirm" in refused["detail"]
 
 
 def test_streams_that_make_no_sense_are_refused(owner: httpx.Client) -> None:

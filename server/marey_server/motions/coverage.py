@@ -324,18 +324,15 @@ def _single(array: NDArray[Any] | None) -> NDArray[np.float32] | None:
 def body_of(rig: bytes) -> MatchingBody:
     """Return the `MatchingBody`, which contains the skeleton of a stream with its mapped joints.
 
-    Raises `MotionError` if joints that define a direction are not mapped.
+    Raises `MotionError` if joints that define a direction are not mapped, or if a person must check the mapping first.
     """
-    from marey_motion.documents import mapping_from_document, skeleton_from_document
+    from marey_motion.documents import skeleton_from_document, trusted_mapping
     from marey_motion.matching.body import MatchingBody
-    from marey_motion.rigs import map_joints
 
     tree = decode_tree(rig, MSGPACK)
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(tree["hierarchy"]))
-    if tree["mapping"] is None:
-        return MatchingBody.from_mapping(skeleton, map_joints(skeleton))
-    mapping, _ = mapping_from_document(SkeletonMapping.model_validate(tree["mapping"]), skeleton)
-    return MatchingBody.from_mapping(skeleton, mapping)
+    stored = None if tree["mapping"] is None else SkeletonMapping.model_validate(tree["mapping"])
+    return MatchingBody.from_mapping(skeleton, trusted_mapping(stored, skeleton)[0])
 
 
 def _load_kernels(body: MatchingBody | None) -> None:

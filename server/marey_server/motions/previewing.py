@@ -214,9 +214,9 @@ def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
 
     Raises `MotionError` if the motion or the skeleton is not valid.
     """
-    from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
+    from marey_motion.documents import clip_from_document, skeleton_from_document, trusted_mapping
     from marey_motion.editing.take import EditedBody
-    from marey_motion.rigs import JointMapping, map_joints, require_trust
+    from marey_motion.rigs import JointMapping
     from marey_motion.skeleton import Skeleton
 
     ref = tree["skeleton"]
@@ -224,9 +224,8 @@ def _clip_of(source: PreviewSource, tree: Tree) -> tuple[Clip, EditedBody]:
     stored = source.mappings.get(ref["item"])
 
     def find_mapping(skeleton: Skeleton) -> JointMapping:
-        if stored is None:
-            return require_trust(map_joints(skeleton))
-        return require_trust(mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)[0])
+        document = None if stored is None else SkeletonMapping.model_validate(stored)
+        return trusted_mapping(document, skeleton)[0]
 
     skeleton = skeleton_from_document(hierarchy)
     return clip_from_document(MotionDocument.model_validate(tree), skeleton), EditedBody(skeleton, find_mapping)

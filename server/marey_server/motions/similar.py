@@ -393,19 +393,15 @@ def _ranks(lists: list[ListedShard]) -> list[Any]:
 
 def _example(order: SimilarOrder) -> tuple[Example, float]:
     """Compute the features of the example; also return its frame rate in Hz."""
-    from marey_motion.documents import clip_from_document, mapping_from_document, skeleton_from_document
+    from marey_motion.documents import clip_from_document, skeleton_from_document, trusted_mapping
     from marey_motion.matching.body import MatchingBody
     from marey_motion.motion import Motion
-    from marey_motion.rigs import map_joints, require_trust
     from marey_motion.similarity.example import Example, sample_offsets
     from marey_motion.similarity.features import INDEX_RATE_HZ, features_at
 
     skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(unpack_tree(order.hierarchy)))
-    if order.mapping is None:
-        mapping = map_joints(skeleton)
-    else:
-        mapping = mapping_from_document(SkeletonMapping.model_validate(unpack_tree(order.mapping)), skeleton)[0]
-    body = MatchingBody.from_mapping(skeleton, require_trust(mapping))
+    stored = None if order.mapping is None else SkeletonMapping.model_validate(unpack_tree(order.mapping))
+    body = MatchingBody.from_mapping(skeleton, trusted_mapping(stored, skeleton)[0])
     clip = clip_from_document(MotionDocument.model_validate(unpack_tree(order.motion)), skeleton)
     first, end = order.request.frames
     offsets = sample_offsets((end - first - 1) / clip.frame_rate_hz)

@@ -15,8 +15,6 @@ from marey_motion.rigs import (
     axes_from_motion,
     doubtful_joints,
     guess_axes,
-    map_joints,
-    require_trust,
 )
 from marey_motion.skeleton import Skeleton
 from marey_schemas.documents.references import RevisionRef
@@ -92,10 +90,8 @@ def _read(context: Context, rig: Rig) -> MappedSkeleton:
     hierarchy = context.document(Kind.SKELETON, rig.skeleton.item, rig.skeleton.revision, "hierarchy")
     skeleton = documents.skeleton_from_document(SkeletonHierarchy.model_validate(hierarchy))
     stored = context.document(Kind.SKELETON, rig.mapping.item, rig.mapping.revision, "mapping", required=False)
-    if stored is None:
-        return _with_axes(skeleton, require_trust(map_joints(skeleton)), {})
-    mapping, axes = documents.mapping_from_document(SkeletonMapping.model_validate(stored), skeleton)
-    return _with_axes(skeleton, require_trust(mapping), axes)
+    document = None if stored is None else SkeletonMapping.model_validate(stored)
+    return _with_axes(skeleton, *documents.trusted_mapping(document, skeleton))
 
 
 def _with_axes(skeleton: Skeleton, mapping: JointMapping, stored: Mapping[str, JointAxes]) -> MappedSkeleton:
