@@ -17,7 +17,6 @@ from marey_motion.arrays import Floats
 from marey_motion.errors import MotionError
 from marey_schemas.documents import metrics
 from marey_schemas.documents.metrics import (
-    MEASUREMENTS,
     METRIC_CODE,
     AngleMeasure,
     Measurement,
@@ -179,68 +178,48 @@ def metric_of(document: MetricDocument) -> PerceptualMetric:
     )
 
 
-def published_component(measurement: Measurement, shaping: Shaping) -> Component:
-    """Make a component with weights that Pražák et al. published.
-
-    Parameters
-    ----------
-    measurement : str    angles, positions or velocities
-    shaping : str    euclid, manhattan or sigmoid
-
-    Returns
-    -------
-    Component    component with the published constant, norm and weights
-
-    Raises
-    ------
-    MotionError    for the shaping `power`, for which nothing was published
-    """
-    if shaping not in metrics.PUBLISHED[measurement]:
-        raise MotionError(
-            "Pražák et al. published no weights for this shaping; use euclid, manhattan or sigmoid", where=shaping
-        )
-    return _component_of(metrics.published_component(measurement, shaping))
-
-
-def published_metric(
-    shaping: Shaping = "sigmoid", shares: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3)
-) -> PerceptualMetric:
-    """Make the metric of Pražák et al.
+def published_metric(shaping: Shaping = "sigmoid") -> PerceptualMetric:
+    """Make the metric of Pražák et al., with equal shares of angles, positions and velocities.
 
     Parameters
     ----------
     shaping : str    euclid, manhattan or sigmoid
-    shares : tuple of float    shares of angles, positions and velocities, which were not published
 
     Returns
     -------
-    PerceptualMetric    three components
+    PerceptualMetric    three components; their shares were not published
 
     Raises
     ------
-    MotionError    for the shaping `power`, and for invalid shares
+    MotionError    for the shaping `power`
     """
-    components = tuple(published_component(measurement, shaping) for measurement in MEASUREMENTS)
-    return PerceptualMetric(f"published, {shaping}", components, shares)
+    return _built_in("published", shaping)
 
 
-def uniform_metric(shaping: Shaping = "manhattan", exponent: float = 1.0) -> PerceptualMetric:
+def uniform_metric(shaping: Shaping = "manhattan") -> PerceptualMetric:
     """Make a metric that weights all joint classes equally, for comparison with fitted metrics.
 
     Parameters
     ----------
-    shaping : str    shaping of all components
-    exponent : float    exponent of the shaping `power`
+    shaping : str    euclid, manhattan or sigmoid, for all components
 
     Returns
     -------
     PerceptualMetric    three components with c = 0 and N = 1, in equal shares
+
+    Raises
+    ------
+    MotionError    for the shaping `power`
     """
-    components = tuple(
-        Component(measurement, shaping, 0.0, 1.0, dict.fromkeys(classes_of(measurement), 1.0), exponent)
-        for measurement in MEASUREMENTS
-    )
-    return PerceptualMetric(f"uniform, {shaping}", components, (1 / 3, 1 / 3, 1 / 3))
+    return _built_in("uniform", shaping)
+
+
+def _built_in(origin: str, shaping: Shaping) -> PerceptualMetric:
+    if shaping == "power":
+        raise MotionError(
+            "the built-in metrics do not have this shaping; use euclid, manhattan or sigmoid", where=shaping
+        )
+    return metric_of(metrics.built_in_metric(f"{origin}/{shaping}"))
 
 
 def shaped(differences: Floats, shaping: Shaping, exponent: float = 1.0) -> Floats:

@@ -263,15 +263,14 @@ def built_in_metric(name: str) -> MetricDocument:
     origin, measurement, printed = found.groups()
     measurements = [one for one in MEASUREMENTS if measurement in (None, one)]
     shaping = next(one for one in PUBLISHED["angles"] if one == printed)
-    make = published_component if origin == "published" else _uniform_component
+    make = _published_component if origin == "published" else _uniform_component
     components = tuple(make(one, shaping, 1.0 / len(measurements)) for one in measurements)
     notes = _published_notes(components) if origin == "published" else ()
     stated = "published" if origin == "published" else "uniform"
     return MetricDocument(name=name, origin=stated, components=components, notes=notes)
 
 
-def published_component(measurement: Measurement, shaping: Shaping, share: float = 1.0) -> MetricComponent:
-    """Return a component with the weights of Pražák et al. (2009). Raises `KeyError` for the shaping `power`."""
+def _published_component(measurement: Measurement, shaping: Shaping, share: float) -> MetricComponent:
     _, constant, norm, *weights = PUBLISHED[measurement][shaping]
     given = {name: weight for name, weight in zip(JOINT_CLASS_NAMES, weights, strict=True) if weight is not None}
     return MetricComponent(

@@ -24,7 +24,7 @@ from marey_motion.perception.measuring import MeasuredClip, classes_measured, me
 from marey_motion.perception.metric import (
     Component,
     PerceptualMetric,
-    published_component,
+    metric_of,
     published_metric,
     uniform_metric,
 )
@@ -57,6 +57,10 @@ def one_component(component: Component, **options: Any) -> PerceptualMetric:
     return replace(PerceptualMetric("one", (component,), (1.0,)), **options)
 
 
+def published(measurement: str, shaping: str) -> Component:
+    return metric_of(built_in_metric(f"published/{measurement}-{shaping}")).components[0]
+
+
 def test_the_published_table_is_as_printed() -> None:
     sums = {}
     for measurement, rows in PUBLISHED.items():
@@ -66,14 +70,14 @@ def test_the_published_table_is_as_printed() -> None:
             assert [weight is None for weight in weights] == [
                 measurement == "angles" and name in ("hand", "toe") for name in classes_of("positions")
             ]
-            component = published_component(measurement, shaping)
+            component = published(measurement, shaping)
             sums[measurement, shaping] = sum(component.weights.values())
             assert component.shares_of(classes_of(measurement)).sum() == pytest.approx(1.0, abs=1e-15)
     odd = {which: round(total, 3) for which, total in sums.items() if abs(total - 1.0) > 0.0015}
     assert odd == {("positions", "sigmoid"): 0.998, ("velocities", "sigmoid"): 1.027}
     assert "1.027" in built_in_metric("published/velocities-sigmoid").notes[0]
     assert not built_in_metric("published/angles-euclid").notes
-    assert published_component("velocities", "sigmoid").weights["thigh"] == 0.0
+    assert published("velocities", "sigmoid").weights["thigh"] == 0.0
     # The mean of the experiment's table is 5/6, so these are the typical differences of a joint.
     expected: dict[Measurement, tuple[float, ...]] = {
         "angles": (0.0222, 0.0261, 0.0267),
@@ -230,7 +234,7 @@ def test_long_maps_come_in_blocks_and_bad_input_is_refused(monkeypatch: pytest.M
         "map-too-large": lambda: motion_map(a, b, metric),
         "frame-rates-differ": lambda: next(map_blocks(a, replace(b, rate_hz=30.0), metric)),
         "skeletons-differ": lambda: next(map_blocks(a, replace(b, skeleton=game_skeleton()), metric)),
-        "mapping-invalid": lambda: published_component("velocities", "manhattan").shares_of(("head", "thigh")),
+        "mapping-invalid": lambda: published("velocities", "manhattan").shares_of(("head", "thigh")),
     }
     for code, call in refused.items():
         with pytest.raises(MotionError) as error:
@@ -240,8 +244,8 @@ def test_long_maps_come_in_blocks_and_bad_input_is_refused(monkeypatch: pytest.M
         lambda: Component("angles", "euclid", 0.0, 1.0, {"hand": 1.0}),
         lambda: Component("angles", "euclid", np.nan, 1.0, {"head": 1.0}),
         lambda: Component("angles", "power", 0.0, 1.0, {"head": 1.0}, exponent=0.0),
-        lambda: published_component("angles", "power"),
-        lambda: published_metric(shares=(0.5, 0.6, -0.1)),
+        lambda: published_metric("power"),
+        lambda: replace(metric, shares=(0.5, 0.6, -0.1)),
         lambda: replace(metric, length_unit_m=0.0),
         lambda: replace(metric, shares=(1.0,)),
     )
@@ -259,7 +263,7 @@ def test_a_skeleton_without_some_joints_is_compared_by_the_others() -> None:
     known = {name: joint for name, joint in body.standard_joints.items() if joint not in fewer}
     clip = measure_motion(Motion.of(gait), replace(body, standard_joints=known), 60.0)
     assert "toe" not in clip.classes
-    component = published_component("positions", "manhattan")
+    component = published("positions", "manhattan")
     found = joint_differences(clip, clip.at(np.arange(60.0)[::-1]), one_component(component), component)
     assert found.shape == (60, 7)
     assert component.shares_of(clip.classes)[clip.classes.index("upper_arm")] == pytest.approx(0.362 / 0.811)
