@@ -65,18 +65,15 @@ def sliding_windows(positions: Floats, headings: Floats, rate_hz: float) -> Wind
     )
 
 
-def measure_coverage(
-    database: MatchingDatabase, options: EvaluationOptions, *, with_in_place: bool = False
-) -> Coverage:
+def measure_coverage(database: MatchingDatabase, options: EvaluationOptions) -> Coverage:
     """Measure the windows of all clips, and the seconds of data in each cell of the trial grid.
 
-    Clips of walking in place, as on a treadmill, would count as standing still; these clips are left out by default.
+    Clips of walking in place, as on a treadmill, would count as standing still; these clips are left out.
 
     Parameters
     ----------
     database : MatchingDatabase    the clips
     options : EvaluationOptions    grid and minimum seconds per cell
-    with_in_place : bool    whether to include clips of walking in place
 
     Returns
     -------
@@ -87,7 +84,7 @@ def measure_coverage(
     owners = [np.empty(0, dtype=np.int32)]
     too_short: list[int] = []
     for index, clip in enumerate(database.clips):
-        if clip.in_place and not with_in_place:
+        if clip.in_place:
             continue
         rows = slice(clip.start, clip.stop)
         windows = sliding_windows(database.root_positions[rows], database.root_headings[rows], rate)

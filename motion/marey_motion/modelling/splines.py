@@ -90,17 +90,16 @@ class SplineBasis:
         """First and last canonical frame that the splines cover."""
         return float(self.knots[self.degree]), float(self.knots[-self.degree - 1])
 
-    def matrix(self, times: ArrayLike, *, derivative: int = 0) -> Floats:
-        """Evaluate the basis functions or their derivatives.
+    def matrix(self, times: ArrayLike) -> Floats:
+        """Evaluate the basis functions.
 
         Parameters
         ----------
         times : (m,) float    canonical frames within the span
-        derivative : int    order of the derivative
 
         Returns
         -------
-        (m, n) float64    values of the basis functions, or their derivatives per frame to the power of `derivative`
+        (m, n) float64    values of the basis functions
 
         Raises
         ------
@@ -112,10 +111,7 @@ class SplineBasis:
         places = np.asarray(times, dtype=np.float64)
         if places.size and not (start <= places.min() and places.max() <= stop):
             raise MotionError(f"canonical times must be from {start:g} to {stop:g}", where="times")
-        if derivative == 0:
-            return np.asarray(BSpline.design_matrix(places, self.knots, self.degree).toarray(), dtype=np.float64)
-        splines = BSpline(self.knots, np.eye(self.count), self.degree)
-        return np.asarray(splines(places, nu=derivative), dtype=np.float64)
+        return np.asarray(BSpline.design_matrix(places, self.knots, self.degree).toarray(), dtype=np.float64)
 
     def fit(self, values: Floats) -> Floats:
         """Fit coefficients to samples by least squares.

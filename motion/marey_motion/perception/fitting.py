@@ -84,7 +84,6 @@ def fit_component(
     perceived: Floats,
     shaping: Shaping,
     exponent: float = 1.0,
-    weights: Floats | None = None,
 ) -> Component:
     """Fit the constant, the norm and the weights of a component to perceived differences.
 
@@ -96,8 +95,6 @@ def fit_component(
     perceived : (R,) float64    perceived difference of each pair; pairs with NaN are left out
     shaping : str    the shaping F
     exponent : float    exponent of the shaping `power`
-    weights : (R,) float64, optional    weights of the pairs in the sum of squares, such as the inverse variances of the
-        perceived differences; 1 if None
 
     Returns
     -------
@@ -108,7 +105,7 @@ def fit_component(
     MotionError    if too few pairs have a perceived difference, or if the best fit gives every class the weight 0
     """
     means = differences.means(shaping, exponent)
-    raw = _solve(means, perceived, weights)
+    raw = _solve(means, perceived)
     total = float(raw[1:].sum())
     if means.mean(axis=0) @ raw[1:] <= _NOTHING:
         raise MotionError(
@@ -142,7 +139,7 @@ def fit_power(differences: PairDifferences, perceived: Floats) -> Component:
 
     def loss(exponent: float) -> float:
         means = differences.means("power", exponent)
-        fitted = _predicted(means, _solve(means, perceived, None))
+        fitted = _predicted(means, _solve(means, perceived))
         return float(np.sum((fitted - perceived)[known] ** 2))
 
     grid = np.geomspace(*EXPONENTS, _GRID)
@@ -259,7 +256,7 @@ def bootstrap_weights(
     times = np.random.default_rng(seed).multinomial(people, np.full(people, 1.0 / people), draws)
     seen, picked = times @ shown, times @ chosen
     perceived = np.where(seen > 0, 1.0 - picked / np.maximum(seen, 1), np.nan)
-    return np.stack([_solve(means, each, None) for each in perceived])
+    return np.stack([_solve(means, each) for each in perceived])
 
 
 def leave_one_motion_out(parts: Sequence[PairDifferences], perceived: Floats, shaping: Shaping) -> Floats:
@@ -288,7 +285,7 @@ def leave_one_motion_out(parts: Sequence[PairDifferences], perceived: Floats, sh
     for motion in np.unique(pairs):
         of_motion = (pairs == motion).any(axis=1)
         others = np.where(of_motion, np.nan, perceived)
-        predicted = [_predicted(each, _solve(each, others, None)) for each in means]
+        predicted = [_predicted(each, _solve(each, others)) for each in means]
         shares = fit_shares(predicted, others)
         total[of_motion] += 0.5 * (np.column_stack(predicted) @ shares)[of_motion]
     return total
@@ -298,7 +295,7 @@ def _predicted(means: Floats, raw: Floats) -> Floats:
     return np.asarray(raw[0] + means @ raw[1:])
 
 
-def _solve(means: Floats, perceived: Floats, weights: Floats | None) -> Floats:
+def _solve(means: Floats, perceived: Floats) -> Floats:
     """Fit the constant and the weights (1 + K,), all at least 0, by least squares over pairs with known differences."""
     known = np.isfinite(perceived)
     if np.count_nonzero(known) < means.shape[1] + 1:
@@ -308,9 +305,6 @@ def _solve(means: Floats, perceived: Floats, weights: Floats | None) -> Floats:
             code="too-few-pairs",
         )
     table, target = np.column_stack((np.ones(len(means)), means))[known], perceived[known]
-    if weights is not None:
-        root = np.sqrt(weights[known])
-        table, target = table * root[:, None], target * root
     scale = np.linalg.norm(table, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     return np.asarray(nnls(table / scale, target)[0] / scale)

@@ -57,16 +57,14 @@ def test_a_clip_of_a_second_or_less_is_listed_as_too_short() -> None:
     assert coverage.clip.tolist() == [1] + [2] * 61
 
 
-def test_clips_that_walk_in_place_are_left_out_unless_asked_for() -> None:
+def test_clips_that_walk_in_place_are_left_out() -> None:
     database = root_database(arc(0.05, 0.0, 2.0), arc(2.0, 0.0, 2.0), arc(0.05, 0.0, 0.5))
     walking, travelling, stepping = database.clips
     database = replace(database, clips=(replace(walking, in_place=True), travelling, replace(stepping, in_place=True)))
-    without, within = (measure_coverage(database, OPTIONS, with_in_place=wanted) for wanted in (False, True))
+    coverage = measure_coverage(database, OPTIONS)
 
-    assert set(without.clip.tolist()) == {1}
-    assert without.too_short == ()
-    assert set(within.clip.tolist()) == {0, 1}
-    assert within.too_short == (2,)
+    assert set(coverage.clip.tolist()) == {1}
+    assert coverage.too_short == ()
 
 
 def test_a_database_without_a_second_of_motion_covers_nothing() -> None:

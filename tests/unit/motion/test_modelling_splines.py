@@ -27,13 +27,6 @@ def test_a_spline_begins_and_ends_at_its_outer_coefficients() -> None:
     np.testing.assert_allclose(basis.at_frames.sum(axis=1), 1.0, atol=1e-14)
 
 
-def test_derivatives_are_those_of_the_functions() -> None:
-    basis = SplineBasis.clamped(20, 8)
-    times, step = np.linspace(1.0, 18.0, 7), 1e-6
-    slopes = (basis.matrix(times + step) - basis.matrix(times - step)) / (2 * step)
-    np.testing.assert_allclose(basis.matrix(times, derivative=1), slopes, atol=1e-8)
-
-
 def test_products_of_basis_functions_are_integrals() -> None:
     basis = SplineBasis.clamped(12, 7)
     for one, other in ((0, 0), (2, 3), (3, 6), (6, 6)):
