@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from marey_reports.drawing.markup import Html, element
 from marey_reports.drawing.page import Section, page, shown
 from marey_reports.drawing.tables import Cell, Number, number, table
 from marey_reports.evaluation.definitions import METRICS, definitions
-from marey_reports.evaluation.figures import SHARED_FIGURES, DrawnFigure, draw_shared_figures
+from marey_reports.evaluation.figures import SHARED_FIGURES, draw_shared_figures
 from marey_reports.evaluation.provenance import provenance
 from marey_reports.evaluation.sentences import region_verdicts, verdict
 from marey_schemas.documents.replicates import LEAST_REPLICATES, MeanInterval
@@ -28,7 +28,6 @@ def render_several(
     *,
     title: str,
     labels: Sequence[str],
-    figures: Mapping[str, DrawnFigure] | None = None,
     inputs: Sequence[ReportInput] = (),
 ) -> str:
     """Render the report of several evaluations under one normaliser as an HTML document.
@@ -38,10 +37,9 @@ def render_several(
     results : at least two evaluations
     comparisons : comparisons of all others with the first
     labels : names of the evaluations, in the same order
-    figures : figures by name, as returned by `draw_shared_figures`; if None, they are drawn
     inputs : the compared revisions, for the head
     """
-    drawn = draw_shared_figures(results, labels) if figures is None else figures
+    drawn = draw_shared_figures(results, labels)
     said = [
         element("li", element("strong", label), ": ", verdict(each))
         for label, each in zip(labels, results, strict=True)

@@ -131,13 +131,9 @@ def draw_figures(
     *,
     other: EvaluationResult | None = None,
     labels: tuple[str, str] = ("before", "after"),
-    options: FigureOptions | None = None,
 ) -> dict[str, DrawnFigure]:
     """Draw the figures that `drawable` lists, of one result or of two results in comparison; return them by name."""
-    return {
-        name: draw_figure(name, result, other=other, labels=labels, options=options)
-        for name in drawable(result, other=other)
-    }
+    return {name: draw_figure(name, result, other=other, labels=labels) for name in drawable(result, other=other)}
 
 
 def drawable(result: EvaluationResult, *, other: EvaluationResult | None = None) -> list[str]:

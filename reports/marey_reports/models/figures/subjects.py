@@ -97,12 +97,27 @@ class ModelSubject:
         """Compute positions (..., P, 3), in metres, of all joints and then all end sites in poses (..., 3 + 4·J)."""
         return points_of(self.primitive.skeleton, poses)
 
-    def moments(self, count: int = MOMENTS) -> tuple[NDArray[np.int64], StripMoments]:
-        """Choose `count` canonical frames as the columns of strips; return these frames, and the columns.
+    def moments(self) -> tuple[NDArray[np.int64], StripMoments]:
+        """Choose `MOMENTS` canonical frames as the columns of strips; return them, ascending, and the columns.
 
-        Each column is centred on the position of the mean motion in the column's frame.
+        The frames are evenly spaced, except that keyframes replace the frames nearest to them. Each column is centred
+        on the position of the mean motion in the column's frame.
         """
-        return choose_moments(self, count)
+        last = self.primitive.frame_count - 1
+        frames = np.unique(np.rint(np.linspace(0, last, MOMENTS)).astype(np.int64))
+        labels = [""] * len(frames)
+        for label, frame in sorted(self.primitive.keyframes.items(), key=lambda each: each[1]):
+            free = [place for place in range(len(frames)) if not labels[place] and frame not in frames[:place]]
+            ends = {0: 0, len(frames) - 1: last}
+            places = [place for place in free if ends.get(place, frame) == frame]
+            if places:
+                place = min(places, key=lambda place: abs(int(frames[place]) - frame))
+                frames[place], labels[place] = frame, shortened(label, LONGEST_LABEL)
+        order = np.argsort(frames, kind="stable")
+        frames, labels = frames[order], [labels[place] for place in order]
+        middles = self.points(self.mean_poses[frames])[:, self.body.pelvis][:, [0, 2]]
+        names = [f"{100 * frame / max(last, 1):.0f} %" for frame in frames]
+        return frames, StripMoments(middles, names, labels)
 
 
 def evenly(count: int, most: int) -> NDArray[np.int64]:
@@ -115,28 +130,6 @@ def points_of(skeleton: Skeleton, poses: Floats) -> Floats:
     flat = np.ascontiguousarray(poses).reshape(-1, poses.shape[-1])
     points = kinematics.forward_kinematics(skeleton, flat, end_sites=True)
     return np.asarray(points.reshape(*poses.shape[:-1], -1, 3), dtype=np.float64)
-
-
-def choose_moments(subject: ModelSubject, count: int) -> tuple[NDArray[np.int64], StripMoments]:
-    """Choose evenly spaced canonical frames, and replace the frames nearest to keyframes by the keyframes.
-
-    Returns the frames in ascending order, and the columns of strips that show them.
-    """
-    last = subject.primitive.frame_count - 1
-    frames = np.unique(np.rint(np.linspace(0, last, count)).astype(np.int64))
-    labels = [""] * len(frames)
-    for label, frame in sorted(subject.primitive.keyframes.items(), key=lambda each: each[1]):
-        free = [place for place in range(len(frames)) if not labels[place] and frame not in frames[:place]]
-        ends = {0: 0, len(frames) - 1: last}
-        places = [place for place in free if ends.get(place, frame) == frame]
-        if places:
-            place = min(places, key=lambda place: abs(int(frames[place]) - frame))
-            frames[place], labels[place] = frame, shortened(label, LONGEST_LABEL)
-    order = np.argsort(frames, kind="stable")
-    frames, labels = frames[order], [labels[place] for place in order]
-    middles = subject.points(subject.mean_poses[frames])[:, subject.body.pelvis][:, [0, 2]]
-    names = [f"{100 * frame / max(last, 1):.0f} %" for frame in frames]
-    return frames, StripMoments(middles, names, labels)
 
 
 def position_table(
