@@ -18,7 +18,7 @@ import numpy as np
 
 from marey_motion import quaternions
 from marey_motion.arrays import Floats
-from marey_motion.rigs.standard import SIDES
+from marey_motion.rigs.standard import split_side
 from marey_motion.skeleton import Skeleton
 
 # Cosine between a listed twist axis and the bone; a limb that disagrees more belongs to other frames.
@@ -126,5 +126,5 @@ def _bone(skeleton: Skeleton, joints: Mapping[str, int], standard: str, ends: Ma
 
 
 def _is_limb(standard: str) -> bool:
-    side, _, joint = standard.partition("_")
-    return side in SIDES and joint in ("shoulder", "elbow", "hip", "knee")
+    side, joint = split_side(standard)
+    return bool(side) and joint in ("shoulder", "elbow", "hip", "knee")

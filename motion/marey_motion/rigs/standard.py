@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from marey_schemas.documents.standard_joints import CENTRE_JOINTS, FINGERS, SIDES, STANDARD_JOINTS
 
-__all__ = ["CENTRE_JOINTS", "CHAINS", "ESSENTIAL_JOINTS", "FINGERS", "SIDES", "STANDARD_JOINTS", "mirrored"]
+__all__ = [
+    "CENTRE_JOINTS",
+    "CHAINS",
+    "ESSENTIAL_JOINTS",
+    "FINGERS",
+    "SIDES",
+    "STANDARD_JOINTS",
+    "mirrored",
+    "split_side",
+]
 
 # Without these a body cannot be read or retargeted as a human's.
 ESSENTIAL_JOINTS = (
@@ -20,6 +29,22 @@ CHAINS = (
     *(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "toe")) for side in SIDES),
     *(tuple(f"{side}_{joint}" for joint in ("clavicle", "shoulder", "elbow", "wrist")) for side in SIDES),
 )
+
+
+def split_side(standard: str) -> tuple[str, str]:
+    """Split the name of a standard joint into its side and the rest.
+
+    Parameters
+    ----------
+    standard : str    standard name
+
+    Returns
+    -------
+    side : str    "left" or "right"; empty for joints of the centre
+    joint : str    name without the side, such as "knee"; for joints of the centre, the whole name
+    """
+    side, _, joint = standard.partition("_")
+    return (side, joint) if side in SIDES else ("", standard)
 
 
 def mirrored(name: str) -> str:
