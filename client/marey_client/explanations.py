@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from marey_client.marey import Marey
 
 
-def explain_job(marey: Marey, job_id: str, *, now: datetime | None = None) -> list[str]:
+def explain_job(marey: Marey, job_id: str) -> list[str]:
     """Explain what a job waits for, which worker runs it, or how it ended; the main reason comes first."""
     job = marey.jobs.get(job_id)
     attempts = list(marey.jobs.attempts(job_id))
     running = list(marey.jobs.list(job.project, filters={"state": JobState.RUNNING.value}))
     workers = _alive_workers(marey) if job.state is JobState.QUEUED else None
-    return explain(job, attempts, running, now or datetime.now(UTC), workers, _limit_of(marey, job))
+    return explain(job, attempts, running, datetime.now(UTC), workers, _limit_of(marey, job))
 
 
 def _limit_of(marey: Marey, job: Job) -> RunningJobs | None:

@@ -74,7 +74,7 @@ def encode_tree(tree: Any, media_type: str, *, arrays: ArrayForm = "plain") -> b
     def leaf(value: NDArray[Any] | EncodedArray) -> dict[str, Any]:
         return _leaf_as_json(value) if media_type == JSON else _leaf_as_bytes(value, arrays)
 
-    plain = _Walk(MAX_DEPTH, on_array=leaf).visit(tree)
+    plain = _Walk(on_array=leaf).visit(tree)
     if media_type == JSON:
         return orjson.dumps(plain, option=orjson.OPT_SERIALIZE_NUMPY)
     if media_type == MSGPACK:
@@ -97,7 +97,6 @@ def decode_tree(
     media_type: str,
     *,
     max_bytes: int = MAX_BYTES,
-    max_depth: int = MAX_DEPTH,
     max_array_bytes: int | None = None,
     keep_blocks: bool = False,
     take_bytes: Callable[[int], None] | None = None,
@@ -114,7 +113,6 @@ def decode_tree(
     if len(data) > max_bytes:
         raise CodecError("too-large", "", f"the document has {len(data)} bytes; at most {max_bytes} are accepted")
     walk = _Walk(
-        max_depth,
         array_bytes=max_bytes if max_array_bytes is None else min(max_bytes, max_array_bytes),
         keep_blocks=keep_blocks,
         take_bytes=take_bytes,
@@ -126,7 +124,7 @@ def decode_tree(
     except CodecError:
         raise
     except (RecursionError, msgpack.StackError) as error:
-        raise CodecError("too-deep", "", f"the document is nested deeper than {max_depth} levels") from error
+        raise CodecError("too-deep", "", f"the document is nested deeper than {MAX_DEPTH} levels") from error
     except (ValueError, bson.errors.BSONError, msgpack.UnpackException) as error:
         raise CodecError("bad-syntax", walk.pointer, f"the document is not valid {media_type}: {error}") from error
 
@@ -280,7 +278,6 @@ class _Walk:
 
     def __init__(
         self,
-        max_depth: int,
         *,
         on_array: Callable[[Any], dict[str, Any]] | None = None,
         array_bytes: int = 0,
@@ -289,7 +286,6 @@ class _Walk:
         max_values: int | None = None,
         max_copied: int = 0,
     ) -> None:
-        self._max_depth = max_depth
         self._on_array = on_array
         self._array_bytes = array_bytes
         self._keep_blocks = keep_blocks
@@ -405,8 +401,8 @@ class _Walk:
         return float(number)
 
     def _enter(self, values: int) -> None:
-        if len(self._path) >= self._max_depth:
-            raise self._error("too-deep", f"the document is nested deeper than {self._max_depth} levels")
+        if len(self._path) >= MAX_DEPTH:
+            raise self._error("too-deep", f"the document is nested deeper than {MAX_DEPTH} levels")
         self._values_left -= values
         if self._values_left < 0:
             raise _too_many_values(self.pointer)

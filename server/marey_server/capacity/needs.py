@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from marey_server.capacity.costs import MeasuredCosts
-from marey_server.store.jobs.policy import DEFAULT_POLICY, QueuePolicy
+from marey_server.store.jobs.policy import DEFAULT_POLICY
 
 HEARTBEAT_SHARE = 0.5
 """Server time of a heartbeat, as a share of the server time of a job: a heartbeat is one write, a job needs two."""
@@ -61,7 +61,7 @@ class Needs:
         return self.parts[0]
 
 
-def compute_needs(costs: MeasuredCosts, demand: PlannedWork, policy: QueuePolicy = DEFAULT_POLICY) -> Needs:
+def compute_needs(costs: MeasuredCosts, demand: PlannedWork) -> Needs:
     """Compute the needs of the work in `demand`, which is assumed to be spread evenly over its days.
 
     `clips_per_day` of the result is the number of clips per day at which the first part is saturated. Heartbeats are
@@ -70,7 +70,7 @@ def compute_needs(costs: MeasuredCosts, demand: PlannedWork, policy: QueuePolicy
     period_s = demand.days * 24 * 3600
     jobs = demand.clips * demand.jobs_per_clip
     work_s = jobs * costs.clip.worker_s
-    heartbeats = work_s / policy.heartbeat_s
+    heartbeats = work_s / DEFAULT_POLICY.heartbeat_s
     busy_s = jobs * costs.job.busy_s + heartbeats * HEARTBEAT_SHARE * costs.job.busy_s
     upload_s = demand.clips * (costs.clip.import_s + demand.clip_bytes * costs.byte.upload_s)
     waits_s = jobs * (costs.job.claim_s + costs.job.complete_s)

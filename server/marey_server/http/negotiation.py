@@ -127,19 +127,19 @@ def _split_parameters(text: str) -> tuple[str, dict[str, str]]:
     return name.strip().lower(), params
 
 
-def body_type(content_type: str | None, known: tuple[str, ...] = codecs.MEDIA_TYPES) -> str:
+def body_type(content_type: str | None) -> str:
     """Return the media type of a body; JSON if the request names none.
 
-    Raises `UnsupportedMediaTypeProblem` if the type is not in `known`, or if the text is not encoded as UTF-8.
+    Raises `UnsupportedMediaTypeProblem` if documents are not read in this type, or if the text is not encoded as UTF-8.
     """
     if not content_type:
         return codecs.JSON
     name, params = _split_parameters(content_type)
-    if name not in known:
+    if name not in codecs.MEDIA_TYPES:
         raise UnsupportedMediaTypeProblem(
-            f"The media type of the body is {name}; this request accepts only: {', '.join(known)}. Name the media "
-            "type of the body in the header Content-Type.",
-            context={"understood": list(known)},
+            f"The media type of the body is {name}; this request accepts only: {', '.join(codecs.MEDIA_TYPES)}. Name "
+            "the media type of the body in the header Content-Type.",
+            context={"understood": list(codecs.MEDIA_TYPES)},
         )
     if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):
         raise UnsupportedMediaTypeProblem(f"Text must be sent as UTF-8, not {params['charset']}.")

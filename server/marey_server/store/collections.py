@@ -143,12 +143,12 @@ def _children(directly_in: str | None, name: str | None) -> list[ColumnElement[b
     return [collection.c.path >= start, func.substr(collection.c.path, 1, len(start)) == start, ~rest.contains("/")]
 
 
-def find_collection(tx: Transaction, project_row: ProjectRow, collection_id: str, *, lock: bool = False) -> Row[Any]:
-    """Return the row of a folder that is not deleted; with `lock`, lock the row.
+def lock_collection(tx: Transaction, project_row: ProjectRow, collection_id: str) -> Row[Any]:
+    """Lock and return the row of a folder that is not deleted.
 
     Raises `NotFoundProblem` if there is no such folder.
     """
-    return _find(tx, project_row, collection_id, _ALIVE, lock=lock)
+    return _find(tx, project_row, collection_id, _ALIVE, lock=True)
 
 
 def _find(

@@ -159,7 +159,7 @@ def _lock(tx: Transaction, project: str, collection_id: str) -> tuple[ProjectRow
     """
     project_row = lock_project(tx, project)
     lock_places(tx, project_row)
-    path = collections.find_collection(tx, project_row, collection_id, lock=True).path
+    path = collections.lock_collection(tx, project_row, collection_id).path
     if not path:
         raise InvalidProblem(
             "The role in the top folder is the role in the project; change the member's role in the project instead.",
