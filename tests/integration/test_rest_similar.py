@@ -27,7 +27,8 @@ from marey_schemas.search import SimilarRequest
 from marey_schemas.sizes import MIB
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import pack_tree
-from marey_server.motions.similar import FoundWindows, ShardFiles, SimilarOrder, search_index
+from marey_server.motions.index_shards import ShardFiles
+from marey_server.motions.similar import FoundWindows, SimilarOrder, search_index
 
 ONE = {"items": ["clip_a"], "revisions": [1], "rows": [60], "joints": [1], "frames": [60], "rates_hz": [30.0]}
 

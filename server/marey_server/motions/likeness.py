@@ -15,10 +15,10 @@ from marey_schemas.search import SimilarRequest
 from marey_schemas.wording import counted
 from marey_server.errors import BadRequestProblem, ConflictProblem, InvalidProblem
 from marey_server.motions.child import Message
+from marey_server.motions.index_shards import ShardFiles
 from marey_server.motions.similar import (
     THREADS,
     FoundExample,
-    ShardFiles,
     SimilarOrder,
     opened,
     read_example,

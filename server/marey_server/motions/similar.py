@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from pydantic import ValidationError
 
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.metrics import MetricDocument, MetricIdentity, built_in_metric, is_built_in
@@ -18,12 +15,11 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy, SkeletonMapping
 from marey_schemas.kinds import Kind
 from marey_schemas.lru import LruCache
 from marey_schemas.problems import FieldError
-from marey_schemas.processes.limits import allow_mapped_files
 from marey_schemas.search import LONGEST_EXAMPLE_S, SimilarAnswer, SimilarMoment, SimilarRequest
-from marey_schemas.sizes import GIB, MIB
 from marey_schemas.wording import counted
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import Message, pack_tree, unpack_tree
+from marey_server.motions.index_shards import MAPPED, ListedShard, ShardFiles, list_of
 from marey_server.store import items
 from marey_server.store.motion_indexes import FoundClip, FoundIndex
 from marey_server.store.transaction import Transaction
@@ -33,7 +29,6 @@ if TYPE_CHECKING:  # numeric modules are loaded by children alone
     from marey_motion.similarity.example import Example
     from marey_motion.similarity.searching import Hit
     from marey_motion.similarity.shard_search import SearchedShard
-    from marey_motion.similarity.shards import Shard
 
 Tree = dict[str, Any]
 
@@ -42,9 +37,6 @@ SEARCH_INDEX = "marey_server.motions.similar:search_index"
 THREADS = 2
 CONTEXT_READ_S = 1.5
 """Seconds that are read before and after the example; the nearest second influences the features of the example."""
-_LISTS_CACHE_BYTES = 64 * MIB
-MOST_MAPPED_BYTES = 4 * GIB
-"""Greatest size of the files that a child process keeps mapped: those of an index of 200,000 s of motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,17 +54,6 @@ class FoundExample:
     frames: tuple[int, int]
     hierarchy: Tree
     mapping: Tree | None
-
-
-class ShardFiles(Message):
-    """Paths of the local files of a shard: the list of its clips, and the features of their poses.
-
-    `dropped` contains the positions in the list of the clips that no longer belong to the index.
-    """
-
-    clips: str
-    poses: str
-    dropped: tuple[int, ...]
 
 
 class SimilarOrder(Message):
@@ -197,87 +178,8 @@ def _invalid(pointer: str, detail: str, code: str = "no-frames") -> InvalidProbl
 # -- in the child ------------------------------------------------------------------------------------------------------
 
 
-class ListedShard:
-    """List of the clips of a shard, with values that are computed once for all searches."""
-
-    def __init__(self, clips: ShardClips) -> None:
-        import numpy as np
-
-        from marey_motion.similarity.shards import Runs
-
-        self.clips = clips
-        self.runs, self.joints = Runs.of(np.array(clips.rows, np.int64)), np.array(clips.joints, np.int64)
-        self.places: dict[str, list[int]] = {}
-        """Positions of each clip in the list."""
-        for place, item in enumerate(clips.items):
-            self.places.setdefault(item, []).append(place)
-
-    @classmethod
-    def read(cls, path: str) -> ListedShard:
-        """Read the list from a file. Raises `ValidationError` if it is damaged."""
-        return cls(ShardClips.model_validate_json(Path(path).read_bytes()))
-
-
-_LISTS: LruCache[str, ListedShard] = LruCache(
-    max_bytes=_LISTS_CACHE_BYTES, size_of=lambda shard: 600 * len(shard.clips.items)
-)
-"""Cache of a child process: lists of clips by the path of their file, which never changes."""
 _RANKS: LruCache[tuple[str, ...], list[Any]] = LruCache(max_entries=4)
 """Cache of a child process: the results of `_ranks`, by the paths of all lists."""
-
-
-class MappedShards:
-    """Shards that a child process keeps mapped into memory between searches, at most `most_bytes` of files.
-
-    Otherwise, up to a quarter of the processor time of a search would go into mapping them again, page by page. The
-    mapped bytes are added to the memory that the process may use: they are files that are only read, so the system can
-    take their memory back.
-    """
-
-    def __init__(self, most_bytes: int) -> None:
-        self._shards: LruCache[tuple[str, str], tuple[Shard, int]] = LruCache(
-            max_bytes=most_bytes, size_of=lambda one: one[1]
-        )
-        """Shards and sizes of their files, by the paths of poses and list of clips.
-
-        Both paths are needed: anybody may write an index, and it can combine the poses of one index with the list of
-        another.
-        """
-        self._allowed_bytes = 0
-
-    @contextmanager
-    def searching(self, shards: Iterable[ShardFiles]) -> Iterator[None]:
-        """Allow the process to map some shards while the `with` block runs; forget shards whose files were removed."""
-        kept = {paths for paths, _ in self._shards.items()}
-        for paths in kept:
-            if not Path(paths[0]).exists():
-                self._shards.pop(paths)
-        new = (files.poses for files in shards if (files.poses, files.clips) not in kept)
-        self._allow(self._kept_bytes() + sum(Path(poses).stat().st_size for poses in new))
-        try:
-            yield
-        finally:
-            self._allow(self._kept_bytes())
-
-    def open(self, files: ShardFiles, listed: ListedShard) -> Shard:
-        """Return a shard, mapped into memory. Raises `MotionError` if its poses do not fit the list of its clips."""
-        from marey_motion.similarity.shards import Shard
-
-        def opened() -> tuple[Shard, int]:
-            path = Path(files.poses)
-            return Shard.open(path, listed.runs, listed.joints), path.stat().st_size
-
-        return self._shards.get_or_make((files.poses, files.clips), opened)[0]
-
-    def _kept_bytes(self) -> int:
-        return sum(size for _, (_, size) in self._shards.items())
-
-    def _allow(self, mapped_bytes: int) -> None:
-        allow_mapped_files(mapped_bytes - self._allowed_bytes)
-        self._allowed_bytes = mapped_bytes
-
-
-_MAPPED = MappedShards(MOST_MAPPED_BYTES)
 
 
 def search_index(packed: bytes) -> bytes:
@@ -332,12 +234,12 @@ def opened(order: SimilarOrder) -> Iterator[OpenedSearch]:
     except MotionError as error:
         raise _invalid("/metric", f"The index cannot be searched by this metric: {error}", error.code) from error
     try:
-        lists = [_list_of(files) for files in order.shards]
+        lists = [list_of(files) for files in order.shards]
         example, rate_hz = _example(order)
         ranks = _RANKS.get_or_make(tuple(files.clips for files in order.shards), lambda: _ranks(lists))
         parts = zip(order.shards, lists, ranks, strict=True)
         shards = [_searched(order, *one, rate_hz, example) for one in parts]
-        with _MAPPED.searching(order.shards):
+        with MAPPED.searching(order.shards):
             yield OpenedSearch(lists, shards, example, rate_hz, metric)
     except MotionError as error:
         raise _invalid("/clip", f"The example cannot be searched for: {error}", error.code) from error
@@ -360,22 +262,6 @@ def _search(order: SimilarOrder, search: OpenedSearch) -> FoundWindows:
         searched_clips=sum(int((~shard.closed).sum()) for shard in search.shards),
         behind=search.behind(order.heads),
     )
-
-
-def _list_of(files: ShardFiles) -> ListedShard:
-    """Read the list of clips of a shard, which may come from any user. Raises `NotFoundProblem` if it is invalid."""
-    path = files.clips
-    try:
-        shard = _LISTS.get_or_make(path, lambda: ListedShard.read(path))
-    except ValidationError as error:
-        raise _damaged() from error
-    if any(number >= len(shard.clips.items) for number in files.dropped):
-        raise _damaged()
-    return shard
-
-
-def _damaged() -> NotFoundProblem:
-    return NotFoundProblem("A list of clips in the index is damaged; build the index again.", code="no-index")
 
 
 def _ranks(lists: list[ListedShard]) -> list[Any]:
@@ -430,7 +316,7 @@ def _searched(
         for own in listed.places.get(order.request.clip, ()):
             closed[own] |= order.request.leave_out == "clip"
             windows[own] = example.rows_around(order.request.frames[0], rate_hz)
-    return SearchedShard(lambda: _MAPPED.open(files, listed), ranks, closed, windows)
+    return SearchedShard(lambda: MAPPED.open(files, listed), ranks, closed, windows)
 
 
 def _window(hit: Hit, clips: ShardClips, length_s: float) -> FoundWindow:

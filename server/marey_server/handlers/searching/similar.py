@@ -11,8 +11,9 @@ from marey_server.http.declarations import Access, reads
 from marey_server.http.reply import Reply
 from marey_server.http.resource import Resource
 from marey_server.motions import likeness, similar
+from marey_server.motions.index_shards import ShardFiles
 from marey_server.motions.likeness import AlikeClips
-from marey_server.motions.similar import FoundWindows, ShardFiles
+from marey_server.motions.similar import FoundWindows
 from marey_server.store import motion_indexes
 from marey_server.store.items import ItemFilters
 from marey_server.store.motion_indexes import FoundIndex
