@@ -36,7 +36,6 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Params = Mapping[str, str | int | float | bool | None]
 
 BLOCKS = "application/msgpack; arrays=blocks"
-MAX_ANSWER_BYTES = 1 << 28
 UNSUPPORTED = 415
 """Status with which servers of earlier versions refuse compressed bodies."""
 LIMITS = httpx.Limits(max_connections=32, max_keepalive_connections=16)
@@ -397,7 +396,7 @@ def read_model(answer: type[Model], response: httpx.Response) -> Model:
 def read_tree(response: httpx.Response) -> Any:
     """Return the document in the body of `response`, with numpy arrays."""
     try:
-        return decode_tree(response.content, media_type_of(response), max_bytes=MAX_ANSWER_BYTES)
+        return decode_tree(response.content, media_type_of(response))
     except CodecError as error:
         raise UnexpectedAnswer(
             f"{response.request.url.path}: this client cannot decode the server's answer ({error}); update the older "

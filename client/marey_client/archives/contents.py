@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from marey_client.errors import UnexpectedAnswer
-from marey_client.transport import BLOCKS, MAX_ANSWER_BYTES, as_json
+from marey_client.transport import BLOCKS, as_json
 from marey_schemas.datasets.contents import MOST_CONTENTS, ContentsRequest, PartOfContent, RequestedDocument
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.encoding.codecs import MSGPACK, decode_tree
@@ -29,7 +29,7 @@ def request_contents(
     """
     url = f"{project_url}/contents"
     response = transport.send_compressed("POST", url, content=as_json(request), headers={"Accept": BLOCKS})
-    answer: dict[str, Any] = decode_tree(response.content, MSGPACK, max_bytes=MAX_ANSWER_BYTES, keep_blocks=keep_blocks)
+    answer: dict[str, Any] = decode_tree(response.content, MSGPACK, keep_blocks=keep_blocks)
     return answer
 
 

@@ -24,6 +24,7 @@ from marey_schemas.encoding.arrayspec import DTYPES, ArrayError, ArraySpec, litt
 
 JSON, MSGPACK, BSON = MEDIA_TYPES = ("application/json", "application/msgpack", "application/bson")
 MAX_BYTES = 1 << 28
+"""Greatest size in bytes of a document that is decoded, and of its arrays together, if a caller sets no other limit."""
 MAX_DEPTH = 64
 MAX_LIST = 1 << 20
 MAX_VALUES = 1 << 21
