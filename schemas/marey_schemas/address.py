@@ -7,6 +7,8 @@ SETTINGS_FILE = "marey.toml"
 """Name of the file with the settings of a server, in its working directory."""
 DEFAULT_DATA = "marey-data"
 """Data folder of a server, if neither an option nor a setting names one."""
+DATABASE_FILE = "marey.db"
+"""Name of the SQLite file in the data folder, if no address of a database is set."""
 ADMIN_TOKEN_FILE = "admin.token"  # noqa: S105 - the name of a file
 """Name of the file in the data folder with the token of the first administrator, which clients on the machine read."""
 DEFAULT_HOST = "127.0.0.1"

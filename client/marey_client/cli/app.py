@@ -42,7 +42,7 @@ from marey_client.cli.queue import jobs, pipelines, schedules, scripts
 from marey_client.cli.studies import conducting, results
 from marey_client.cli.terminal.failures import usage_in_plain_words
 from marey_client.cli.terminal.invocation import Invocation
-from marey_schemas.address import SERVER_VARIABLES
+from marey_schemas.address import ADMIN_TOKEN_FILE, SERVER_VARIABLES
 
 OTHER_NAMES = {
     "cancel": "job cancel",
@@ -156,7 +156,8 @@ def marey(
         Path | None,
         typer.Option(
             help="File that contains a token and nothing else. Default: the token in the variable MAREY_TOKEN, else "
-            "the token of `marey login`, else the token in admin.token in the data folder of a server on this machine."
+            f"the token of `marey login`, else the token in {ADMIN_TOKEN_FILE} in the data folder of a server on this "
+            "machine."
         ),
     ] = None,
     verbose: Annotated[

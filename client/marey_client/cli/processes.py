@@ -9,7 +9,7 @@ import typer
 
 from marey_client.cli.terminal.invocation import AsJson, connect
 from marey_client.cli.terminal.output import print_json, print_table
-from marey_schemas.address import DEFAULT_HOST, DEFAULT_PORT
+from marey_schemas.address import DATABASE_FILE, DEFAULT_DATA, DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
 from marey_schemas.queue.log_lines import LogForm
 
 db = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Manage the database of a server on this machine.")
@@ -19,15 +19,16 @@ workers = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 DataFolder = Annotated[
     Path | None,
     typer.Option(
-        help="Data folder of the server; default: MAREY_DATA, otherwise `data` in marey.toml, otherwise ./marey-data."
+        help=f"Data folder of the server; default: MAREY_DATA, otherwise `data` in {SETTINGS_FILE}, otherwise "
+        f"./{DEFAULT_DATA}."
     ),
 ]
 DatabaseUrl = Annotated[
     str | None,
     typer.Option(
-        help="URL of a Postgres database, postgresql://...; default: the SQLite file marey.db in the data folder. "
-        "Other users of this machine can see the options of a command: if the URL contains a password, set the "
-        "environment variable MAREY_DATABASE_URL instead."
+        help=f"URL of a Postgres database, postgresql://...; default: the SQLite file {DATABASE_FILE} in the data "
+        "folder. Other users of this machine can see the options of a command: if the URL contains a password, set "
+        "the environment variable MAREY_DATABASE_URL instead."
     ),
 ]
 

@@ -10,7 +10,7 @@ from urllib.parse import quote, urlsplit
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, TomlConfigSettingsSource
 
-from marey_schemas.address import DEFAULT_DATA, DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
+from marey_schemas.address import DATABASE_FILE, DEFAULT_DATA, DEFAULT_HOST, DEFAULT_PORT, SETTINGS_FILE
 from marey_schemas.names import form
 from marey_schemas.sizes import KIB, MIB
 from marey_server.access.network_addresses import Network, read_network
@@ -47,8 +47,8 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
     port: int = Field(DEFAULT_PORT, ge=0, le=65535, description="Port to listen on; 0: any free port.")
     database_url: str | None = Field(
         None,
-        description="SQLAlchemy URL of the database, such as postgresql://...; absent: the SQLite file marey.db in the "
-        "data folder.",
+        description="SQLAlchemy URL of the database, such as postgresql://...; absent: the SQLite file "
+        f"{DATABASE_FILE} in the data folder.",
     )
     database_password_file: Path | None = Field(
         None,
@@ -392,7 +392,7 @@ class Settings(ProcessSettings, BlobSettings, IdentitySettings, TraceSettings):
 
         The URL contains the password in `database_password_file`, so it must not be logged.
         """
-        url = self.database_url or f"sqlite:///{(self.data / 'marey.db').absolute()}"
+        url = self.database_url or f"sqlite:///{(self.data / DATABASE_FILE).absolute()}"
         if self.database_password_file is None:
             return url
         user, _, place = urlsplit(url).netloc.partition("@")

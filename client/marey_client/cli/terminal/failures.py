@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from marey_schemas.address import ADMIN_TOKEN_FILE
 from marey_schemas.wording import first_reason, plain_reason, printable
 
 FAILED, WRONG_USAGE = 1, 2
@@ -18,7 +19,7 @@ MOST_SHOWN = 80
 
 ANONYMOUS_HINT = (
     "no token was found: run `marey login`, or give --token-file. A server on this machine stores a token in the file "
-    "admin.token of its data folder; the variable MAREY_DATA can name this folder."
+    f"{ADMIN_TOKEN_FILE} of its data folder; the variable MAREY_DATA can name this folder."
 )
 
 
