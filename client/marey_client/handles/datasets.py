@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from marey_client.arguments import checked, checks_arguments
-from marey_client.errors import Conflict, NotFound, RequestFailed
+from marey_client.errors import Conflict, Invalid, NotFound
 from marey_client.handles.versions import DatasetHandle
 from marey_client.paging import pages
 from marey_client.progress import OnProgress, ignore_progress
@@ -191,7 +191,7 @@ def _fast_forward(dataset: DatasetHandle, branch: str, commit: str) -> bool:
     """
     try:
         preview = dataset.merge(commit, into=branch, preview=True)
-    except RequestFailed:  # nothing to merge, or no single common version: a person must decide
+    except (Conflict, Invalid):  # nothing to merge, or no single common version: a person must decide
         return False
     if preview.base != preview.ours:
         return False

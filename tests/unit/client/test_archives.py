@@ -19,7 +19,18 @@ from marey_client.archives import receiving
 from marey_client.archives.receiving import ReceivingDataset, send_versions
 from marey_client.archives.transfers import MOST_DAYS_KEPT, MissingCommits, copy_missing, transfers_folder
 from marey_client.archives.writing import short_name, write_archive
-from marey_client.errors import ArchiveInUse, BadRequest, LargeCommit
+from marey_client.errors import (
+    ArchiveInUse,
+    BadRequest,
+    Conflict,
+    Forbidden,
+    Invalid,
+    LargeCommit,
+    RequestFailed,
+    Unavailable,
+)
+from marey_client.handles.datasets import _fast_forward
+from marey_client.handles.versions import DatasetHandle
 from marey_client.progress import ignore_progress
 from marey_schemas.datasets.commits import TIME_OF_COMMIT, Commit, Entry
 from marey_schemas.datasets.differences import DatasetDifference
@@ -251,3 +262,20 @@ def test_a_copy_with_a_commit_that_no_server_receives_ends_before_documents_are_
     missing = MissingCommits(tuple(dataset.commits), ())
     with pytest.raises(LargeCommit):
         copy_missing(dataset, missing, lambda _archive: None, ignore_progress)
+
+
+@pytest.mark.parametrize(
+    ("failure", "hidden"), [(Conflict, True), (Invalid, True), (Forbidden, False), (Unavailable, False)]
+)
+def test_only_a_merge_that_a_person_must_decide_leaves_the_branch_without_an_error(
+    failure: type[RequestFailed], hidden: bool
+) -> None:
+    def merge(*_versions: str, **_options: Any) -> None:
+        raise failure(Problem(type="", title="", status=failure.status, detail="", instance="", code=""))
+
+    dataset = cast(DatasetHandle, SimpleNamespace(merge=merge))
+    if hidden:
+        assert not _fast_forward(dataset, "main", "sha256:new")
+        return
+    with pytest.raises(failure):
+        _fast_forward(dataset, "main", "sha256:new")
