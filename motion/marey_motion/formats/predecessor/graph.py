@@ -156,9 +156,7 @@ def _type(node: Mapping[str, Any], place: Place, file: str) -> str:
     return str(kind)
 
 
-def _transitions(
-    node: Mapping[str, Any], place: Place, known: _Known, file: str
-) -> tuple[Place, ...]:
+def _transitions(node: Mapping[str, Any], place: Place, known: _Known, file: str) -> tuple[Place, ...]:
     given = node.get("transitions", {})
     if not isinstance(given, Mapping):
         raise FormatError(f"{'/'.join(place)}: 'transitions' must be an object", file=file)
