@@ -12,7 +12,7 @@ from marey_client.arguments import checked, checks_arguments
 from marey_client.errors import UnexpectedAnswer
 from marey_client.handles.invitations import AccountInvitations
 from marey_client.paging import pages
-from marey_client.transport import Transport, as_json, read_model
+from marey_client.transport import Transport, as_json, named_path, read_model
 from marey_schemas.access import (
     EndTokens,
     FolderRole,
@@ -64,7 +64,7 @@ class Users:
 
     def get(self, name: str) -> User:
         """Return the user with this name. Raises `NotFound` if there is none."""
-        return self.transport.get(User, f"/users/{name}")
+        return self.transport.get(User, _user(name))
 
     def create(self, user: UserCreate) -> User:
         """Create a user. Raises `Conflict` if the name is taken."""
@@ -72,28 +72,26 @@ class Users:
 
     def change(self, name: str, change: UserChange) -> User:
         """Change a user. Users who change their own password must also send their current password."""
-        return read_model(
-            User, self.transport.send("PATCH", f"/users/{name}", content=as_json(change), headers=ANY_STATE)
-        )
+        return read_model(User, self.transport.send("PATCH", _user(name), content=as_json(change), headers=ANY_STATE))
 
     def disable(self, name: str) -> None:
         """Disable a user: password, tokens and sign-ins do not work until `enable` is called. The data is kept.
 
         Also pauses the user's schedules and withdraws the user's invitations; `enable` does not undo this.
         """
-        self.transport.send("DELETE", f"/users/{name}", headers=ANY_STATE)
+        self.transport.send("DELETE", _user(name), headers=ANY_STATE)
 
     def identities(self, name: str) -> Iterator[Identity]:
         """List the people at identity providers who can sign in as a user."""
-        return pages(self.transport, Identity, f"/users/{name}/identities")
+        return pages(self.transport, Identity, f"{_user(name)}/identities")
 
     def link(self, name: str, identity: IdentityLink) -> Identity:
         """Link a person at an identity provider with a user; the person can then sign in as this user."""
-        return self.transport.post(Identity, f"/users/{name}/identities", identity, repeatable=True)
+        return self.transport.post(Identity, f"{_user(name)}/identities", identity, repeatable=True)
 
     def unlink(self, name: str, identity_id: str) -> None:
         """Remove the link between a person at an identity provider and a user, and end all sign-ins of the user."""
-        self.transport.send("DELETE", f"/users/{name}/identities/{identity_id}", repeatable=False)
+        self.transport.send("DELETE", named_path(f"{_user(name)}/identities", identity_id), repeatable=False)
 
     def end_tokens(self, name: str, which: EndTokens = EndTokens.ALL) -> User:
         """Revoke all tokens of a user, or only the tokens from `marey login`; the token of this client stays valid."""
@@ -101,11 +99,11 @@ class Users:
 
     def quotas(self, name: str) -> QuotasInUse:
         """Return the number of items and bytes that count towards a user's quotas, and the limits."""
-        return self.transport.get(QuotasInUse, f"/users/{name}/quotas")
+        return self.transport.get(QuotasInUse, f"{_user(name)}/quotas")
 
     def change_quotas(self, name: str, change: QuotaChange) -> QuotasInUse:
         """Change the quotas of a user; None restores the limit of the server's settings. For administrators."""
-        return change_quotas(self.transport, f"/users/{name}/quotas", change, QuotasInUse)
+        return change_quotas(self.transport, f"{_user(name)}/quotas", change, QuotasInUse)
 
     def enable(self, name: str) -> User:
         """Enable a disabled user again, with the same password and tokens; the user's schedules stay paused."""
@@ -158,7 +156,11 @@ class Tokens:
 
     def revoke(self, token_id: str, *, with_created: bool = False) -> None:
         """Revoke a token at once; with `with_created`, also revoke the tokens that were created with this token."""
-        self.transport.send("DELETE", f"/tokens/{token_id}", params={"with_created": with_created or None})
+        self.transport.send("DELETE", named_path("/tokens", token_id), params={"with_created": with_created or None})
+
+
+def _user(name: str) -> str:
+    return named_path("/users", name)
 
 
 @checks_arguments
@@ -179,7 +181,7 @@ class Members:
             Member,
             self.transport.send(
                 "PUT",
-                f"/projects/{self.project}/members/{user}",
+                named_path(f"/projects/{self.project}/members", user),
                 content=as_json(checked(MemberChange, role=role)),
                 headers=ANY_STATE,
                 repeatable=True,
@@ -193,7 +195,9 @@ class Members:
 
     def remove(self, user: str) -> None:
         """Remove a user from the project, and remove the user's roles in folders."""
-        self.transport.send("DELETE", f"/projects/{self.project}/members/{user}", headers=ANY_STATE, repeatable=False)
+        self.transport.send(
+            "DELETE", named_path(f"/projects/{self.project}/members", user), headers=ANY_STATE, repeatable=False
+        )
 
 
 @checks_arguments
@@ -227,4 +231,4 @@ class FolderRoles:
         self.transport.send("DELETE", self._url(folder, user), headers=ANY_STATE, repeatable=False)
 
     def _url(self, folder: Collection, user: str) -> str:
-        return f"/projects/{self.project}/collections/{folder.id}/roles/{user}"
+        return named_path(f"/projects/{self.project}/collections/{folder.id}/roles", user)

@@ -14,7 +14,7 @@ from marey_client.keywords.asking import DifferenceKeywords, LineageKeywords
 from marey_client.listing.paths import missing_path, require_folder
 from marey_client.listing.tables import summary_table
 from marey_client.paging import pages
-from marey_client.transport import Params, Transport, as_json, read_model, sends_nothing
+from marey_client.transport import Params, Transport, as_json, named_path, read_model, sends_nothing
 from marey_schemas.documents.differences import Difference, DifferenceRequest
 from marey_schemas.items import (
     Item,
@@ -77,7 +77,7 @@ class ItemHandle:
 
     def part(self, part: str, *, revision: int | None = None, **query: str | None) -> dict[str, Any]:
         """Return the document of a part, with numpy arrays: of the given revision, or of the newest one."""
-        tree, _ = self.transport.get_tree(f"{self.url}/parts/{part}", {"revision": revision, **query})
+        tree, _ = self.transport.get_tree(named_path(f"{self.url}/parts", part), {"revision": revision, **query})
         return dict(tree)
 
     def put_part(self, part: str, document: Mapping[str, Any], *, message: str | None = None) -> Item:
@@ -86,7 +86,11 @@ class ItemHandle:
         Raises `PreconditionFailed` if the item was changed since it was read.
         """
         response = self.transport.send_tree(
-            "PUT", f"{self.url}/parts/{part}", document, params={"message": message}, headers=self._if_match()
+            "PUT",
+            named_path(f"{self.url}/parts", part),
+            document,
+            params={"message": message},
+            headers=self._if_match(),
         )
         return self._renewed(read_model(Item, response))
 
@@ -313,7 +317,7 @@ class Items(Generic[Handle]):
 
     def get(self, item_id: str) -> Handle:
         """Return the item with this id. Raises `NotFound` if there is none."""
-        return self._handle(self.transport.get(Item, f"{self.url}/{item_id}"))
+        return self._handle(self.transport.get(Item, named_path(self.url, item_id)))
 
     def count(self, *, collection: str | None = None, filters: Params | None = None) -> int:
         """Count the items in the folder `collection` and below it; without `collection`, in the whole project."""
@@ -322,7 +326,7 @@ class Items(Generic[Handle]):
 
     def restore(self, item_id: str) -> Handle:
         """Restore the deleted item with this id, and return it."""
-        return self._handle(self.transport.post(Item, f"{self.url}/{item_id}/restore"))
+        return self._handle(self.transport.post(Item, f"{named_path(self.url, item_id)}/restore"))
 
     def create(
         self,

@@ -348,6 +348,17 @@ class _Connections:
         )
 
 
+def named_path(path: str, name: str) -> str:
+    """Return the path of the resource with a name or an id below `path`.
+
+    Raises `BadArgument` if `name` is empty or contains a slash: the request would reach another resource, such as the
+    identities of a user instead of the user.
+    """
+    if not name or "/" in name:
+        raise BadArgument(f"{name!r} is neither a name nor an id; these are not empty and contain no slash")
+    return f"{path}/{name}"
+
+
 def _quoted(path: str) -> str:
     """Return a path with its names percent-encoded, because names may contain any character.
 

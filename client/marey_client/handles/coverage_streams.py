@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from marey_client.arguments import checked, checks_arguments, several
 from marey_client.paging import pages
-from marey_client.transport import Transport, read_model
+from marey_client.transport import Transport, named_path, read_model
 from marey_schemas.coverage_streams import (
     CoverageProgress,
     CoverageStream,
@@ -54,7 +54,7 @@ class CoverageStreams:
     def get(self, stream_id: str) -> CoverageStreamHandle:
         """Return a handle that continues a stream after its last frame; another process may have created the stream."""
         return CoverageStreamHandle(
-            self.transport, self.url, self.transport.get(CoverageStream, f"{self.url}/{stream_id}")
+            self.transport, self.url, self.transport.get(CoverageStream, named_path(self.url, stream_id))
         )
 
     def list(self) -> Iterator[CoverageStream]:

@@ -14,7 +14,7 @@ from marey_client.errors import Conflict, Invalid, NotFound
 from marey_client.handles.versions import DatasetHandle
 from marey_client.paging import pages
 from marey_client.progress import OnProgress, ignore_progress
-from marey_client.transport import Transport, sends_nothing
+from marey_client.transport import Transport, named_path, sends_nothing
 from marey_schemas.datasets.commits import Commit
 from marey_schemas.datasets.naming import MAIN, Dataset, DatasetCreate, Ref, RefKind
 
@@ -132,7 +132,7 @@ class Datasets:
     @sends_nothing
     def at(self, name: str) -> DatasetHandle:
         """Return a handle of the dataset with this name; no request is sent."""
-        return DatasetHandle(self.transport, f"{self.url}/{name}")
+        return DatasetHandle(self.transport, named_path(self.url, name))
 
 
 def _known_commits(dataset: DatasetHandle, ref: Ref | None) -> Callable[[str], bool]:

@@ -8,7 +8,7 @@ from datetime import timedelta
 
 from marey_client.arguments import checked, checks_arguments
 from marey_client.paging import pages
-from marey_client.transport import Transport
+from marey_client.transport import Transport, named_path
 from marey_schemas.access import Role
 from marey_schemas.invitations import AccountInvitationCreate, Invitation, InvitationCreate, NewInvitation
 
@@ -29,7 +29,7 @@ class _OpenInvitations:
 
     def withdraw(self, named: str) -> None:
         """Withdraw an open invitation, named by its `id` or its `prefix`, the text between the two `_` of its code."""
-        self.transport.send("DELETE", f"{self.url}/{named}", repeatable=False)
+        self.transport.send("DELETE", named_path(self.url, named), repeatable=False)
 
 
 @checks_arguments

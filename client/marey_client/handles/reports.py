@@ -9,6 +9,7 @@ from typing import Any
 from marey_client.arguments import checks_arguments
 from marey_client.downloads import safe_file_name, saved_atomically
 from marey_client.items import ItemHandle
+from marey_client.transport import named_path
 from marey_schemas.documents.reports import StoredFigure
 
 
@@ -46,7 +47,7 @@ class ReportedHandle(ItemHandle):
         Figures of single trials need the name of the `trial`.
         """
         params = {"format": format, "trial": trial, "table": table}
-        return self._fetch(f"{self.url}/figures/{name}", "*/*", params)
+        return self._fetch(named_path(f"{self.url}/figures", name), "*/*", params)
 
     def save_report(self, path: str | Path) -> Path:
         """Write the report to a file, and return the path of the file."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from marey_client.arguments import checked, checks_arguments
 from marey_client.jobs import Jobs
 from marey_client.paging import pages
-from marey_client.transport import Transport, as_json, read_model, sends_nothing
+from marey_client.transport import Transport, as_json, named_path, read_model, sends_nothing
 from marey_schemas.queue.jobs import Job, JobCreate
 from marey_schemas.queue.schedules import Schedule, ScheduleChange, ScheduleCreate
 
@@ -57,7 +57,7 @@ class Schedules:
     @sends_nothing
     def at(self, name: str) -> ScheduleHandle:
         """Return a handle of the schedule with this name; no request is sent."""
-        return ScheduleHandle(self.transport, self.project, f"{self.url}/{name}")
+        return ScheduleHandle(self.transport, self.project, named_path(self.url, name))
 
 
 @checks_arguments

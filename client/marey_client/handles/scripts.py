@@ -8,7 +8,7 @@ from typing import Any
 
 from marey_client.arguments import checked, checks_arguments
 from marey_client.paging import pages
-from marey_client.transport import Transport, sends_nothing
+from marey_client.transport import Transport, named_path, sends_nothing
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.comparisons import GOALS, MOST_COMPARED, Goal, RunComparison
 from marey_schemas.queue.jobs import Job, JobInput
@@ -43,7 +43,7 @@ class Scripts:
     @sends_nothing
     def at(self, name: str) -> ScriptHandle:
         """Return a handle of the script with this name; no request is sent."""
-        return ScriptHandle(self.transport, f"{self.url}/{name}")
+        return ScriptHandle(self.transport, named_path(self.url, name))
 
 
 @checks_arguments

@@ -17,6 +17,7 @@ from marey_client.items import ItemHandle, Items
 from marey_client.jobs import Jobs, OnProgress, job_request
 from marey_client.keywords.processing import AnalyseStudyKeywords
 from marey_client.paging import pages
+from marey_client.transport import named_path
 from marey_schemas.documents.references import RevisionRef
 from marey_schemas.documents.studies import StudyDocument, StudyMotion
 from marey_schemas.queue.job_params import AnalyseStudyParams
@@ -59,7 +60,7 @@ class StudyHandle(ItemHandle):
 
     def withdraw(self, participant: str) -> None:
         """Delete consent and trials of a participant, named by id. Only maintainers and owners may do this."""
-        self.transport.send("DELETE", f"{self.url}/participants/{participant}", repeatable=True)
+        self.transport.send("DELETE", named_path(f"{self.url}/participants", participant), repeatable=True)
 
     def progress(self) -> StudyProgress:
         """Return the numbers of participants and answered trials, over all revisions of the study."""

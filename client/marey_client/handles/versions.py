@@ -16,7 +16,7 @@ from marey_client.handles.bisections import Bisection, IsBad, OnStep, bisect, re
 from marey_client.handles.proposals import Proposals
 from marey_client.paging import pages
 from marey_client.progress import OnProgress, ignore_progress
-from marey_client.transport import Params, Transport, as_json, read_model
+from marey_client.transport import Params, Transport, as_json, named_path, read_model
 from marey_schemas.datasets.checkouts import CheckoutAnswer, CheckoutRequest
 from marey_schemas.datasets.commits import Commit, CommitCreate, Entry, EntryChange, EntryOrigins
 from marey_schemas.datasets.differences import DatasetDifference, ListedCommit
@@ -120,7 +120,7 @@ class DatasetHandle:
 
     def at(self, version: str = MAIN) -> Commit:
         """Return the commit that a version names: a branch, a tag or a digest."""
-        return self.transport.get(Commit, f"{self.url}/commits/{version}")
+        return self.transport.get(Commit, named_path(f"{self.url}/commits", version))
 
     def has(self, commit: str) -> bool:
         """Return whether the dataset has the commit with this digest."""
@@ -342,25 +342,28 @@ class DatasetHandle:
         """
         body = as_json(RefMove(at=to))
         state = ANY_STATE if expected_rev is None else {"If-Match": f'"{expected_rev}.json"'}
-        return read_model(Ref, self.transport.send("PATCH", f"{self.url}/refs/{name}", content=body, headers=state))
+        return read_model(Ref, self.transport.send("PATCH", self._ref(name), content=body, headers=state))
 
     def ref(self, name: str) -> Ref:
         """Return the branch or the tag with this name; a branch includes its protection rule.
 
         Raises `NotFound` if there is none.
         """
-        return self.transport.get(Ref, f"{self.url}/refs/{name}")
+        return self.transport.get(Ref, self._ref(name))
 
     def protect(self, branch: str, rule: ProtectionRule) -> Ref:
         """Protect a branch by a rule, which replaces an earlier rule. The caller must be a maintainer or owner."""
-        body, url = as_json(rule), f"{self.url}/refs/{branch}/protection"
+        body, url = as_json(rule), f"{self._ref(branch)}/protection"
         return read_model(Ref, self.transport.send("PUT", url, content=body, headers=ANY_STATE))
 
     def unprotect(self, branch: str) -> Ref:
         """Remove the protection of a branch."""
-        url = f"{self.url}/refs/{branch}/protection"
+        url = f"{self._ref(branch)}/protection"
         return read_model(Ref, self.transport.send("DELETE", url, headers=ANY_STATE))
+
+    def _ref(self, name: str) -> str:
+        return named_path(f"{self.url}/refs", name)
 
     def delete_ref(self, name: str) -> None:
         """Delete a branch or a tag; the commits stay."""
-        self.transport.send("DELETE", f"{self.url}/refs/{name}", headers=ANY_STATE)
+        self.transport.send("DELETE", self._ref(name), headers=ANY_STATE)

@@ -10,7 +10,7 @@ from datetime import timedelta
 from marey_client.arguments import checked, checks_arguments
 from marey_client.asynchronous.interruption import pause
 from marey_client.paging import pages
-from marey_client.transport import Params, Transport, as_json, read_model, sends_nothing
+from marey_client.transport import Params, Transport, as_json, named_path, read_model, sends_nothing
 from marey_schemas.event_kinds import DEFAULT_WEBHOOK_KINDS, ProjectEventKind
 from marey_schemas.webhooks import (
     DeliveryState,
@@ -51,7 +51,7 @@ class Webhooks:
     @sends_nothing
     def at(self, webhook_id: str) -> WebhookHandle:
         """Return a handle of the webhook with this id; no request is sent."""
-        return WebhookHandle(self.transport, f"{self.url}/{webhook_id}")
+        return WebhookHandle(self.transport, named_path(self.url, webhook_id))
 
 
 @checks_arguments
@@ -89,11 +89,13 @@ class WebhookHandle:
 
     def delivery(self, delivery_id: str) -> WebhookDelivery:
         """Return a delivery with the result of its last attempt."""
-        return self.transport.get(WebhookDelivery, f"{self.url}/deliveries/{delivery_id}")
+        return self.transport.get(WebhookDelivery, named_path(f"{self.url}/deliveries", delivery_id))
 
     def redeliver(self, delivery_id: str) -> WebhookDelivery:
         """Request that a delivery is sent once more; the method `wait` returns its result."""
-        return self.transport.post(WebhookDelivery, f"{self.url}/deliveries/{delivery_id}/redeliver", repeatable=False)
+        return self.transport.post(
+            WebhookDelivery, f"{named_path(f'{self.url}/deliveries', delivery_id)}/redeliver", repeatable=False
+        )
 
     def test(self) -> WebhookDelivery:
         """Request a delivery of the kind `webhook.test`; the method `wait` returns its result."""
