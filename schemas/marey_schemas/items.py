@@ -8,7 +8,7 @@ from pydantic import Field
 from marey_schemas.access import Role
 from marey_schemas.base import Answer, Request
 from marey_schemas.kinds import Kind
-from marey_schemas.names import MOST_TAGS, CollectionPath, Digest, ItemName, Message, Tag
+from marey_schemas.names import MOST_TAGS, Digest, ItemName, Message, ReceivingPath, Tag
 from marey_schemas.sizes import MOST_INTEGER
 
 LOOP_TAG = "loop"
@@ -18,13 +18,13 @@ LOOP_TAG = "loop"
 class CollectionCreate(Request):
     """Request to create a folder; missing parents are created, too."""
 
-    path: CollectionPath = Field(min_length=1)
+    path: ReceivingPath = Field(min_length=1)
 
 
 class CollectionChange(Request):
     """Request to move or rename a folder with its contents."""
 
-    path: CollectionPath = Field(min_length=1)
+    path: ReceivingPath = Field(min_length=1)
 
 
 class Collection(Answer):
@@ -47,7 +47,7 @@ class ItemCreate(Request):
     """Request to create an item with its first revision; each part is a document."""
 
     name: ItemName
-    collection: CollectionPath = ""
+    collection: ReceivingPath = ""
     tags: tuple[Tag, ...] = Field((), max_length=MOST_TAGS)
     parts: dict[str, Any] = Field(min_length=1)
     message: Message = ""
@@ -57,7 +57,7 @@ class ItemChange(Request):
     """Request to rename, move or tag an item; absent fields are unchanged."""
 
     name: ItemName | None = None
-    collection: CollectionPath | None = None
+    collection: ReceivingPath | None = None
     tags: tuple[Tag, ...] | None = Field(None, max_length=MOST_TAGS)
 
 

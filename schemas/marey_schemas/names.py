@@ -3,7 +3,7 @@
 import re
 from typing import Annotated
 
-from pydantic import StringConstraints
+from pydantic import AfterValidator, StringConstraints
 
 FORMS: dict[str, str] = {}
 """Explanation of each pattern for error texts, by the pattern; it continues the words "the text must"."""
@@ -53,6 +53,20 @@ NameSuffix = Annotated[str, StringConstraints(max_length=64, pattern=_SUFFIX)]
 
 CollectionPath = Annotated[str, StringConstraints(max_length=1024, pattern=_PATH)]
 """Path of a collection: names joined by `/`, without a leading or trailing slash; the empty path is the root."""
+
+
+def _without_dots(path: str) -> str:
+    """Refuse . and .. in a path. They would refer to other folders in a file system, but would be names here."""
+    if {".", ".."} & set(path.split("/")):
+        raise ValueError(
+            "the path of a folder must not contain . or ..; write the names of the folders, "
+            "beginning at the top of the project"
+        )
+    return path
+
+
+ReceivingPath = Annotated[CollectionPath, AfterValidator(_without_dots)]
+"""Path of a collection that receives items; no name in it is `.` or `..`."""
 
 Tag = Annotated[str, StringConstraints(min_length=1, max_length=64, pattern=_TAG)]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from marey_schemas.base import Options
 from marey_schemas.formats import UNITS_M, EndIndex, LengthUnit
-from marey_schemas.names import MOST_TAGS, CollectionPath, Tag
+from marey_schemas.names import MOST_TAGS, ReceivingPath, Tag
 
 UpAxis = Literal["x", "y", "z", "-x", "-y", "-z"]
 Handedness = Literal["right", "left"]
@@ -29,7 +29,7 @@ class ImportOptions(Options):
     4.0
     """
 
-    collection: CollectionPath = Field("", description="Folder of the project that receives the clips.")
+    collection: ReceivingPath = Field("", description="Folder of the project that receives the clips.")
     skeleton: str | None = Field(
         None,
         description="Item id of the skeleton that the clips must use. `marey upload` also accepts its address "
@@ -77,17 +77,6 @@ class ImportOptions(Options):
     subject: str | None = Field(None, max_length=255, description="Performer, under a pseudonym.")
     licence: str | None = Field(None, max_length=255, description="Licence of the data.")
     capture_system: str | None = Field(None, max_length=255, description="The device or system that recorded the data.")
-
-    @field_validator("collection")
-    @classmethod
-    def _names_folders(cls, path: str) -> str:
-        """Refuse . and .. in a path. They would refer to other folders in a file system, but would be names here."""
-        if {".", ".."} & set(path.split("/")):
-            raise ValueError(
-                "the path of a folder must not contain . or ..; write the names of the folders, "
-                "beginning at the top of the project"
-            )
-        return path
 
     @property
     def metres_per_unit(self) -> float | None:

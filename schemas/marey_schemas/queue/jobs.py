@@ -12,7 +12,7 @@ from pydantic import Field
 from marey_schemas.base import Answer, Request
 from marey_schemas.datasets.naming import MAIN, DatasetName, Version
 from marey_schemas.kinds import Kind
-from marey_schemas.names import CollectionPath, Message
+from marey_schemas.names import CollectionPath, Message, ReceivingPath
 from marey_schemas.queue.commits import CommitConflict, JobCommit, OutputsCommit
 from marey_schemas.queue.own_pods import GPUS_LABEL, MOST_GPUS
 from marey_schemas.sizes import SEEDS
@@ -169,7 +169,7 @@ class JobCreate(Request):
     kind: str = Field(min_length=1, max_length=64)
     inputs: dict[str, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
     params: dict[str, Any] = Field(default_factory=dict)
-    into: CollectionPath = Field("", description="The collection that receives the results.")
+    into: ReceivingPath = Field("", description="The collection that receives the results.")
     priority: int = Field(0, ge=-100, le=100, description="Priority; jobs of higher priority run first.")
     after: tuple[str, ...] = Field((), max_length=1000, description="Jobs that must succeed before this one starts.")
     on_failure: Literal["fail", "skip"] = Field(

@@ -5,7 +5,7 @@ from typing import Any, Self
 from pydantic import Field, model_validator
 
 from marey_schemas.base import Request
-from marey_schemas.names import CollectionPath, ItemName
+from marey_schemas.names import ItemName, ReceivingPath
 from marey_schemas.queue.job_params import AlignParams, AnnotateParams, CutParams, ImportParams, ModelParams, TreeParams
 from marey_schemas.queue.jobs import ExistingInput, ItemInput
 from marey_schemas.queue.pipelines import PipelineCreate, PipelineStep
@@ -21,7 +21,7 @@ class ModelPlan(Request):
     """
 
     name: ItemName = Field(description="Name of the model, and also of the action that it generates.")
-    into: CollectionPath = Field(
+    into: ReceivingPath = Field(
         min_length=1, description="The collection of the model; everything else is stored below it."
     )
     files: ImportParams | None = Field(None, description="Files of takes to import.")

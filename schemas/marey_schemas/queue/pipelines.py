@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self
 from pydantic import Field, StringConstraints
 
 from marey_schemas.base import Answer, Request
-from marey_schemas.names import CollectionPath, Message, form
+from marey_schemas.names import Message, ReceivingPath, form
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import CacheMode, Job, JobCreate, JobInput, JobOutputsInput, Resources
 from marey_schemas.sizes import SEEDS
@@ -45,7 +45,7 @@ class PipelineStep(Request):
         description="Steps that must succeed first, in addition to the steps that make the inputs of this step.",
     )
 
-    into: CollectionPath | None = None
+    into: ReceivingPath | None = None
     priority: int | None = Field(None, ge=-100, le=100)
     cache: CacheMode | None = None
     seed: int | None = Field(None, ge=0, lt=SEEDS)
@@ -60,7 +60,7 @@ class PipelineCreate(Request):
     """Request to submit jobs that depend on each other, all or none."""
 
     steps: dict[StepName, PipelineStep] = Field(min_length=1, max_length=MOST_STEPS)
-    into: CollectionPath = Field("", description="The collection that receives the results.")
+    into: ReceivingPath = Field("", description="The collection that receives the results.")
     priority: int = Field(0, ge=-100, le=100)
     cache: CacheMode = "use"
     seed: int = Field(0, ge=0, lt=SEEDS)

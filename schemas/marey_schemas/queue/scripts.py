@@ -14,7 +14,7 @@ from marey_schemas.base import Answer, Request
 from marey_schemas.consents import ConsentOverride
 from marey_schemas.formats import FORMATS, WHOLE_FORMATS, ExportFormat
 from marey_schemas.kinds import Kind
-from marey_schemas.names import SLUG, CollectionPath, Message, form
+from marey_schemas.names import SLUG, Message, ReceivingPath, form
 from marey_schemas.queue.commits import OutputsCommit
 from marey_schemas.queue.jobs import InputSpec, JobInput, JobState, Resources
 from marey_schemas.queue.own_pods import Image
@@ -349,7 +349,7 @@ class ScriptRunCreate(ConsentOverride):
         default_factory=dict, max_length=MOST_DECLARED, description="Values of the parameters."
     )
     inputs: dict[FieldName, JobInput | tuple[JobInput, ...]] = Field(default_factory=dict)
-    into: CollectionPath = Field("", description="The collection that receives the clips.")
+    into: ReceivingPath = Field("", description="The collection that receives the clips.")
     seed: int = Field(0, ge=0, lt=SEEDS, description="Value of the environment variable MAREY_SEED of the script.")
     message: Message = Field("", description="Message of the run, shown in the history of its results.")
     commit: OutputsCommit | None = Field(

@@ -7,7 +7,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
 
 import marey_schemas
-from marey_schemas.names import FORMS, CollectionPath, ItemName, ProjectName, Tag, UserName
+from marey_schemas.names import FORMS, CollectionPath, ItemName, ProjectName, ReceivingPath, Tag, UserName
 from marey_schemas.wording import counted, first_reason, plain_reason
 
 
@@ -32,6 +32,7 @@ def test_a_noun_in_y_or_x_takes_the_plural_of_its_kind(noun: str, expected: str)
         (UserName, "Ann!", "letters, digits, dots"),
         (ItemName, "a/b", "no slash"),
         (CollectionPath, "/raw/", "names joined by single slashes"),
+        (ReceivingPath, "raw/../x", "must not contain . or .."),
         (Tag, "a,b", "no comma"),
     ],
 )
