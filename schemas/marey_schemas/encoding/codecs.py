@@ -126,6 +126,8 @@ def decode_tree(
         raise
     except (RecursionError, msgpack.StackError) as error:
         raise CodecError("too-deep", "", f"the document is nested deeper than {MAX_DEPTH} levels") from error
+    except UnicodeDecodeError as error:
+        raise CodecError("bad-syntax", walk.pointer, "the document has text that is not encoded as UTF-8") from error
     except (ValueError, bson.errors.BSONError, msgpack.UnpackException) as error:
         raise CodecError("bad-syntax", walk.pointer, f"the document is not valid {media_type}: {error}") from error
 

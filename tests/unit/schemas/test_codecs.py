@@ -147,7 +147,8 @@ def test_json_that_other_formats_could_not_carry_is_refused(text: str, code: str
 
 
 def test_json_must_be_utf_8() -> None:
-    assert refusal('{"a": "é"}'.encode("latin-1"), JSON).code == "bad-syntax"
+    error = refusal('{"a": "é"}'.encode("latin-1"), JSON)
+    assert (error.code, str(error)) == ("bad-syntax", "document: the document has text that is not encoded as UTF-8")
 
 
 @pytest.mark.parametrize(
