@@ -23,7 +23,7 @@ class Unreachable(MareyError):
 
 
 class ConnectionClosed(MareyError):
-    """The async client was closed before a call ended, or before the call began."""
+    """The client was closed before a call ended, or before the call began."""
 
     def __init__(self) -> None:
         super().__init__("the client is closed; keep it open until all calls have ended")

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 
 from marey_client.asynchronous.interruption import note_at_hand, stop_if_interrupted
 from marey_client.credentials import BearerToken, TokenFile, require_address, resolve, trusted_authorities
-from marey_client.errors import BadArgument, RequestFailed, UnexpectedAnswer, Unreachable, error_of
+from marey_client.errors import BadArgument, ConnectionClosed, RequestFailed, UnexpectedAnswer, Unreachable, error_of
 from marey_client.retries import BUSY_STATUSES, NEVER_ARRIVED, Retries, retry_after_s
 from marey_client.tracing import TracedRequest, calling
 from marey_client.unanswered import explain_silence, media_type_of, not_of_marey, require_marey, server_of
@@ -133,7 +133,7 @@ class Transport:
 
     def close(self) -> None:
         """Close every connection to the server."""
-        self._client.close()
+        self._connections.close()
 
     # -- models --------------------------------------------------------------------------------------------------------
 
@@ -328,12 +328,20 @@ class _Connections:
         self._opened = (os.getpid(), self._open())
 
     def client(self) -> httpx.Client:
-        """Return the HTTP client of this process."""
+        """Return the HTTP client of this process. Raises `ConnectionClosed` if it was closed."""
         process, client = self._opened
         if process != os.getpid():
             client = self._open()
             self._opened = (os.getpid(), client)
+        if client.is_closed:
+            raise ConnectionClosed
         return client
+
+    def close(self) -> None:
+        """Close the connections of this process; those of the process that forked it stay open."""
+        process, client = self._opened
+        if process == os.getpid():
+            client.close()
 
     def _open(self) -> httpx.Client:
         return httpx.Client(

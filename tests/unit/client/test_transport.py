@@ -46,6 +46,14 @@ def test_a_read_is_sent_again_when_the_connection_is_lost(script: ScriptedServer
     assert len(script.waited) == 2
 
 
+def test_a_request_of_a_closed_client_is_refused_in_plain_words(script: ScriptedServer) -> None:
+    marey = script.marey()
+    marey.close()
+    marey.close()  # closing twice does no harm
+    with pytest.raises(errors.ConnectionClosed, match="the client is closed; keep it open"):
+        marey.project("lab").read()
+
+
 @pytest.mark.parametrize("broken", [LOST, httpx.RemoteProtocolError("Server disconnected")])
 def test_a_server_that_stops_during_the_first_request_is_waited_for(script: ScriptedServer, broken: Exception) -> None:
     script.answers = [broken, *[NEVER_CONNECTED] * transport.TRIES_TO_REACH, ok(PROJECT)]
