@@ -144,6 +144,13 @@ def test_files_of_one_request_with_the_same_skeleton_show_the_axis(owner: httpx.
     assert axes == {"z"}
 
 
+def test_a_file_that_is_sent_without_a_form_is_refused_with_the_type_of_forms(owner: httpx.Client) -> None:
+    headers = {"Content-Type": "application/x-www-form-urlencoded"}
+    refused = owner.post("/projects/lab/imports", content=bvh(), headers=headers)
+    assert refused.status_code == 415
+    assert "accepts only: multipart/form-data, application/json" in refused.json()["detail"]
+
+
 def test_file_names_with_control_characters_are_refused_and_harm_no_other(owner: httpx.Client) -> None:
     def part(file_name: str) -> bytes:
         head = f'--B\r\nContent-Disposition: form-data; name="files"; filename="{file_name}"\r\n\r\n'

@@ -67,7 +67,7 @@ class ProjectImports(Resource):
             spooled_bytes = min(settings.import_files_now * SPOOLED_BYTES, settings.import_bytes_now)
             self.hold_body(BATCH_BYTES + MAX_FORM_BYTES + spooled_bytes)
         else:
-            body_type(content_type)
+            body_type(content_type, others=("multipart/form-data",))
             self.hold_body(MAX_LIST_BYTES)
         self.body = bytearray()
         self._file: tuple[str, Receiver] | None = None

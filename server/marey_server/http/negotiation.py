@@ -127,8 +127,8 @@ def _split_parameters(text: str) -> tuple[str, dict[str, str]]:
     return name.strip().lower(), params
 
 
-def body_type(content_type: str | None) -> str:
-    """Return the media type of a body; JSON if the request names none.
+def body_type(content_type: str | None, *, others: tuple[str, ...] = ()) -> str:
+    """Return the media type of a body; JSON if the request names none. Errors also name the types in `others`.
 
     Raises `UnsupportedMediaTypeProblem` if documents are not read in this type, or if the text is not encoded as UTF-8.
     """
@@ -136,10 +136,11 @@ def body_type(content_type: str | None) -> str:
         return codecs.JSON
     name, params = _split_parameters(content_type)
     if name not in codecs.MEDIA_TYPES:
+        accepted = [*others, *codecs.MEDIA_TYPES]
         raise UnsupportedMediaTypeProblem(
-            f"The media type of the body is {name}; this request accepts only: {', '.join(codecs.MEDIA_TYPES)}. Name "
-            "the media type of the body in the header Content-Type.",
-            context={"understood": list(codecs.MEDIA_TYPES)},
+            f"The media type of the body is {name}; this request accepts only: {', '.join(accepted)}. Name the media "
+            "type of the body in the header Content-Type.",
+            context={"understood": accepted},
         )
     if params.get("charset", "utf-8") not in ("utf-8", "utf8", "us-ascii"):
         raise UnsupportedMediaTypeProblem(f"Text must be sent as UTF-8, not {params['charset']}.")
