@@ -393,6 +393,7 @@ def test_a_mistyped_address_is_a_page_in_a_browser_and_a_problem_document_elsewh
             assert refused.status_code == 404
             assert refused.headers["Content-Type"] == "application/problem+json"
             assert refused.json()["code"] == "not-found"
+            assert "/api/v1/docs lists the addresses" in refused.json()["detail"]
     assert httpx.post(f"{server.address}/nothing", headers={"Accept": browser}, content=b"x").status_code == 404
     missing = httpx.get(f"{server.api}/projects/nothing", headers={"Accept": browser})
     assert missing.headers["Content-Type"] == "application/problem+json", "a resource has one form of errors"

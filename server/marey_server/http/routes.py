@@ -61,7 +61,7 @@ class UnknownPath(Resource):
     tag = ""
 
     def _check_head(self) -> None:
-        raise NotFoundProblem("No resource has this address.")
+        raise NotFoundProblem("No resource has this address; /api/v1/docs lists the addresses of this server.")
 
     def problem_answer(self, error: BaseException) -> Rendered:
         """Return a short page if the client prefers HTML, and otherwise the problem document."""
