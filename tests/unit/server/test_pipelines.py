@@ -96,6 +96,7 @@ def test_one_bad_step_lets_none_in(desk: Desk, changes: dict[str, Any], pointer:
     with pytest.raises(InvalidProblem) as refused:
         submit(desk, steps)
     assert [(error.pointer, error.code) for error in refused.value.errors] == [(pointer, code)]
+    assert "?." not in refused.value.errors[0].detail  # a question, such as "did you mean 'cut'?", needs no full stop
     assert desk.database.read(desk.user, reading.list_jobs, "lab").items == ()
 
 

@@ -171,7 +171,7 @@ def _check(
     try:
         kind = find_kind(request.kind)
     except UnknownKindError as error:
-        raise _invalid(f"{at}/kind", "unknown-kind", f"{error}.") from error
+        raise _invalid(f"{at}/kind", "unknown-kind", str(error)) from error
     try:
         params = kind.params.model_validate(request.params)
     except ValidationError as error:
