@@ -93,18 +93,19 @@ def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -
     """Return the error for an address without an item of these kinds, with the nearest address or other advice."""
     from marey_schemas.kinds import Kind
 
+    place = shlex.quote(str(address))
     if not address.path:
         marey.project(address.project).read()  # raises the error that names the nearest project
         return WrongUsage(
-            f"{address} is a project, but the command needs the path of an item; `marey ls {address}` lists it"
+            f"{address} is a project, but the command needs the path of an item; `marey ls {place}` lists it"
         )
     if marey.project(address.project).collections.at(address.path) is not None:
-        return WrongUsage(f"{address} is a folder; `marey ls {address}` lists it")
+        return WrongUsage(f"{address} is a folder; `marey ls {place}` lists it")
     if address.is_folder:
         what, kinds = "no folder", ()
     elif (other := find_item(marey, address, [one for one in Kind if one not in kinds])) is not None:
         kind = other.item.kind.noun
-        return WrongUsage(f"there is {what} at {address}, but a {kind}; `marey show {address}` shows it")
+        return WrongUsage(f"there is {what} at {address}, but a {kind}; `marey show {place}` shows it")
     return WrongUsage(f"there is {what} at {address}; {advice(marey.project(address.project), address.path, kinds)}")
 
 

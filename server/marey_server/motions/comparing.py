@@ -94,7 +94,7 @@ def read_difference(
     before = request.from_ or (after - 1 if other.id == item.id else item.revision)
     if before < 1:
         raise NotFoundProblem(
-            "The item has no revision before revision 1; give another `from` and `to`, or another item as `to_item`.",
+            "The item has no revision before revision 1; compare it with another item, or compare two other revisions.",
             code="no-revision",
         )
     numbers = {"after": (other, after), "before": (item, before)}  # a revision that was asked for is missed first

@@ -33,7 +33,10 @@ def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | Non
     poses: EncodedArray = motion["poses"]
     chosen = range(*(frames or slice(None)).indices(poses.shape[0]))
     if not chosen:
-        detail = f"The motion has {counted(poses.shape[0], 'frame')}; the range contains none of them."
+        detail = (
+            f"The motion has {counted(poses.shape[0], 'frame')}; the range contains none of them. Write first:end, "
+            "with the first frame before the end, counted from 0."
+        )
         raise _invalid("frames", "no-frames", detail)
     names = list(motion["joints"])
     wanted = names if joints is None else list(joints)
