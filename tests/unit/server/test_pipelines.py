@@ -76,7 +76,7 @@ def test_two_that_are_handed_in_at_once_are_computed_once(desk: Desk) -> None:
 @pytest.mark.parametrize(
     ("changes", "pointer", "code"),
     [
-        ({"square": {"kind": "cube"}}, "/steps/square/kind", "unknown-kind"),
+        ({"square": {"kind": "sqaure"}}, "/steps/square/kind", "unknown-kind"),
         ({"sum": {"params": {"numbre": 1}}}, "/steps/sum/params/numbre", "extra-forbidden"),
         (
             {"sum": {"kind": "annotate", "params": {"proposal": {"method": "steps", "longest_s": 0.1}}}},
