@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from importlib import import_module
 
 import numpy as np
 import pytest
+from docs.generate import ROOT
 
 from marey_motion.clip import Clip
 from marey_motion.exporting import write_clip_file
@@ -26,6 +29,18 @@ def clip() -> Clip:
 def test_a_format_that_is_read_has_a_reader_called_after_it(row: FileFormat) -> None:
     if row.reads:
         assert callable(getattr(import_module(f"marey_motion.formats.{row.name}"), f"read_{row.name}"))
+
+
+def test_the_architecture_shows_how_readers_of_motion_are_called() -> None:
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text("utf-8")
+    shown = re.search(r"`read_<name>\((.*?)\)`", page)
+    assert shown is not None
+    for row in (row for row in FORMATS if "motion" in row.reads):
+        reader = getattr(import_module(f"marey_motion.formats.{row.name}"), f"read_{row.name}")
+        taken = inspect.signature(reader).parameters.values()
+        positional = [one.name for one in taken if one.kind is one.POSITIONAL_OR_KEYWORD]
+        always = [f"{one.name}={one.default}" for one in taken if one.name == "frame_rate_hz"]
+        assert shown[1] == ", ".join((*positional, "*", *always)), row.name
 
 
 @pytest.mark.parametrize("name", MOTION_FORMATS)
