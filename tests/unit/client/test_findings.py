@@ -117,7 +117,7 @@ def test_weights_of_the_objective_are_read_by_name() -> None:
     weight = next(one for one in OPTIMISE.options if one.path == ("objective",))
     assert weight.spellings == ("--objective", "--weight")
     assert weight.read(["seconds=0.001", "offset=2"]) == {"seconds": 0.001, "offset": 2.0}
-    with pytest.raises(WrongUsage, match="with one of offset, "):
+    with pytest.raises(WrongUsage, match="the names are offset, "):
         weight.read(["length=1"])
     with pytest.raises(WrongUsage, match="'much' is not a number"):
         weight.read(["seconds=much"])
