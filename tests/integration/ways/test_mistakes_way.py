@@ -24,7 +24,7 @@ MISTAKES: tuple[tuple[str, int, str], ...] = (
     ("upload page.bvh --project lab", 1, "a BVH file begins with HIERARCHY"),
     ("upload half.bvh --project lab", 1, "half.bvh:"),
     ("archive create lab/gaits half.bvh", 1, "half.bvh exists and is not an archive, so it is not replaced"),
-    ("view 'lab/walks/walk 1 0' --out nowhere/v.png", 1, "there is no folder nowhere; create it"),
+    ("view 'lab/walks/walk 1 0' --out half.bvh/v.png", 1, "half.bvh exists already, as a file"),
     ("download 'lab/walks/walk 1 0' -o half.bvh", 1, "half.bvh exists already, as a file; choose another name"),
     ("ls lab --token-file nowhere.token", 1, "nowhere.token cannot be read"),
     # units, axes, rates, and other values
@@ -33,6 +33,7 @@ MISTAKES: tuple[tuple[str, int, str], ...] = (
     ("upload half.bvh --project lab --fps 0", 2, "--frame-rate-hz: the value must be above 0"),
     ("upload half.bvh --project lab --tag a,b", 2, "the text must contain no comma and no control characters"),
     ("upload half.bvh --project lab --collection ../x", 2, "must not contain . or .."),
+    ("upload half.bvh --project lab --collection lab/raw", 1, "for lab/raw, give --collection raw"),
     ("model lab/walks --into models --criterion BIC", 2, "did you mean 'bic'?"),
     ("evaluate lab/walks --families circel", 2, "did you mean 'circle'?"),
     ("view 'lab/walks/walk 1 0' --out v.png --frames 20:10", 2, "with the first frame before the end"),

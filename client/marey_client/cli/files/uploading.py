@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from marey_client.marey import Marey
+    from marey_client.project import ProjectHandle
     from marey_schemas.imports import ImportEntry
 
 
@@ -63,6 +64,7 @@ def upload(
     with connect(context) as marey:
         to = marey.project(project)
         to.read()  # a missing project is an error before any bytes are sent
+        _note_doubled_project(to, options.get("collection", ""))
         if "/" in options.get("skeleton", ""):
             options["skeleton"] = _skeleton_at(marey, project, options["skeleton"])
         try:
@@ -80,6 +82,15 @@ def upload(
         _print_restored(report.restored, found.changed_tables, f"{project}/{options.get('collection', '')}".rstrip("/"))
     if found.motions_left_out or report.failed:
         raise Refused
+
+
+def _note_doubled_project(project: ProjectHandle, collection: str) -> None:
+    """Print a note if a folder is written with its project, as an address, although the project has no such folder."""
+    first, _, rest = collection.partition("/")
+    if rest and first == project.name and project.collections.at(first) is None:
+        print_message(
+            f"note: the clips get the folder {project.name}/{collection}; for {collection}, give --collection {rest}"
+        )
 
 
 def _skeleton_at(marey: Marey, project: str, place: str) -> str:
