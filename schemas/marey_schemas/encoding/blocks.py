@@ -22,7 +22,8 @@ BLOCK_FRAMES = 256
 GROUP_COLUMNS = 1024
 NARROW_COLUMNS = 64  # an array with fewer columns gets longer blocks: small tiles compress badly
 MAX_TILE_BYTES = 1 << 24
-MAX_ARRAY_BYTES = 1 << 30
+MAX_RESULT_BYTES = 1 << 30
+"""Greatest number of bytes that `decode` returns by default; documents allow less for an array."""
 
 
 class BlockError(ValueError):
@@ -212,7 +213,7 @@ def decode(
     *,
     frames: slice | None = None,
     columns: NDArray[np.intp] | None = None,
-    max_bytes: int = MAX_ARRAY_BYTES,
+    max_bytes: int = MAX_RESULT_BYTES,
 ) -> NDArray[Any]:
     """Decode an array, or some of its frames and columns; only the tiles that contain the wanted values are read.
 
