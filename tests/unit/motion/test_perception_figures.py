@@ -27,7 +27,7 @@ def test_the_example_of_the_explanation_draws_both_figures(
     (example,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
     names: dict[str, Any] = {}
     exec(example, names)
-    assert re.findall(r"^(\w+), manhattan", capsys.readouterr().out, re.MULTILINE) == ["published", "uniform"]
+    assert re.findall(r"^(\w+)/manhattan ", capsys.readouterr().out, re.MULTILINE) == ["published", "uniform"]
     assert {path.name for path in tmp_path.iterdir()} == {"figure-1.png", "figure-6.png"}
     components, registration = names["figures"]
     assert isinstance(components, Sketch)
