@@ -230,7 +230,9 @@ def _read_members(data: bytes, file: str) -> dict[str, NDArray[Any]]:
     except _ARCHIVE_ERRORS as error:
         if isinstance(error, FormatError):
             raise
-        raise FormatError(f"the archive is damaged: {error}", code="not-npz", file=file) from error
+        raise FormatError(
+            f"the archive is damaged ({error}); copy or export the file again", code="not-npz", file=file
+        ) from error
 
 
 def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

@@ -127,6 +127,12 @@ def test_an_archive_of_another_kind_is_told_what_it_is(members: tuple[str, ...],
     assert refused.value.code == "not-npz"
 
 
+def test_a_file_that_is_no_archive_is_refused_with_a_remedy() -> None:
+    with pytest.raises(FormatError, match="copy or export the file again") as refused:
+        read_motion(b"PK\x03\x04 and then a text", "walk.npz")
+    assert refused.value.code == "not-npz"
+
+
 def test_an_archive_that_unpacks_to_too_much_is_refused_unopened(
     archive: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
