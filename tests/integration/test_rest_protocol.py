@@ -112,6 +112,20 @@ def test_frames_and_joints_cut_as_slicing_does(owner: httpx.Client, clip: str, a
     np.testing.assert_array_equal(cut["poses"], np.delete(whole, slice(7, 11), axis=1)[5:])
 
 
+@pytest.mark.parametrize(
+    ("query", "remedy"),
+    [
+        ("joints=hip", "has no joint 'hip'; did you mean 'hips'?"),
+        ("joints=Q", "has no joint 'Q'; its joints are hips,"),
+        ("frames=9:3", "Write first:end"),
+    ],
+)
+def test_a_refused_cut_says_what_can_be_cut(owner: httpx.Client, clip: str, query: str, remedy: str) -> None:
+    answer = owner.get(f"{clip}/parts/motion?{query}")
+    assert answer.status_code == 422
+    assert remedy in answer.text
+
+
 def test_models_come_in_every_form(owner: httpx.Client, clip: str) -> None:
     shown = owner.get(clip).json()
     assert msgpack.unpackb(owner.get(clip, headers={"Accept": "application/msgpack"}).content) == shown

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from marey_schemas.encoding import blocks
 from marey_schemas.encoding.arrays import EncodedArray
 from marey_schemas.problems import FieldError
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, listed, nearest
 from marey_server.errors import InvalidProblem
 
 Tree = dict[str, Any]
@@ -41,7 +41,9 @@ def slice_motion(motion: Tree, frames: slice | None, joints: Sequence[str] | Non
     names = list(motion["joints"])
     wanted = names if joints is None else list(joints)
     if unknown := [name for name in wanted if name not in names]:
-        raise _invalid("joints", "no-joint", f"The motion has no joint {unknown[0]!r}.")
+        near = nearest(unknown[0], names)
+        remedy = f"did you mean {near!r}?" if near else f"its joints are {listed(names)}."
+        raise _invalid("joints", "no-joint", f"The motion has no joint {unknown[0]!r}; {remedy}")
     if len(set(wanted)) != len(wanted) or not wanted:
         raise _invalid("joints", "bad-joints", "Give at least one joint, and no joint twice.")
     cut["joints"] = wanted
