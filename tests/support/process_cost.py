@@ -35,6 +35,10 @@ class ProcessCost:
         """Return the resident memory of the process and its children in MB."""
         return sum(self._status_kb(pid, "VmRSS") for pid in self._family()) / 1e3
 
+    def own_resident_mb(self) -> float:
+        """Return the resident memory of the process without its children in MB."""
+        return self._status_kb(self.pid, "VmRSS") / 1e3
+
     def own_peak_mb(self) -> float:
         """Return the greatest resident memory of the process without its children since `reset_peak`, in MB."""
         return self._status_kb(self.pid, "VmHWM") / 1e3

@@ -73,7 +73,7 @@ class Record:
     waits_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     faults: Counter[str] = field(default_factory=Counter)
     memory: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: defaultdict(list))
-    """Time in seconds and memory in MB of each server."""
+    """Time in seconds and memory in MB of each server: with its child processes, and alone."""
 
 
 def run(trial: LoadTrial, say: Say) -> list[str]:
@@ -216,7 +216,9 @@ def _read_memory(made: Installation, record: Record, stopping: threading.Event) 
     begun = time.monotonic()
     while not stopping.wait(SAMPLE_EVERY_S):
         for name, cost in costs.items():
-            record.memory[name].append((time.monotonic() - begun, cost.resident_mb()))
+            at = time.monotonic() - begun
+            record.memory[name].append((at, cost.resident_mb()))
+            record.memory[f"{name} without its children"].append((at, cost.own_resident_mb()))
 
 
 def _growth(samples: list[tuple[float, float]]) -> Growth:
