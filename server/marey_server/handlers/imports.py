@@ -18,7 +18,7 @@ from marey_server.errors import ApiProblem, BadRequestProblem, InvalidProblem, N
 from marey_server.field_errors import field_errors
 from marey_server.handlers.uploads import store_in_pieces
 from marey_server.http.declarations import Access, Files, RequestBody, writes
-from marey_server.http.multipart import MultipartReader, PartHead, Piece, boundary_of
+from marey_server.http.multipart import FORM, MultipartReader, PartHead, Piece, boundary_of
 from marey_server.http.negotiation import body_type
 from marey_server.http.receiving import BATCH_BYTES, Receiver
 from marey_server.http.reply import Reply
@@ -67,7 +67,7 @@ class ProjectImports(Resource):
             spooled_bytes = min(settings.import_files_now * SPOOLED_BYTES, settings.import_bytes_now)
             self.hold_body(BATCH_BYTES + MAX_FORM_BYTES + spooled_bytes)
         else:
-            body_type(content_type, others=("multipart/form-data",))
+            body_type(content_type, others=(FORM,))
             self.hold_body(MAX_LIST_BYTES)
         self.body = bytearray()
         self._file: tuple[str, Receiver] | None = None

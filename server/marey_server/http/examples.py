@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from typing import Any
 from urllib.parse import quote, urlencode
 
+from marey_server.http.multipart import FORM
+
 Schema = Mapping[str, Any]
 
 _DEEPEST = 6
@@ -138,7 +140,7 @@ def curl_command(method: str, path: str, operation: Schema, shared: list[dict[st
         words.append('-H "Authorization: Bearer $MAREY_TOKEN"')
     words += [f"-H '{one['name']}: {one['example']}'" for one in needed if one["in"] == "header"]
     content = operation.get("requestBody", {}).get("content", {})
-    if "multipart/form-data" in content:
+    if FORM in content:
         words.append("-F files=@walk.bvh")
     elif "application/octet-stream" in content:
         words.append("--data-binary @walk.bvh")

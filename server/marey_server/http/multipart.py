@@ -11,6 +11,8 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from marey_schemas.sizes import KIB
 from marey_server.errors import BadRequestProblem, TooLargeProblem, UnsupportedMediaTypeProblem
 
+FORM = "multipart/form-data"
+"""Media type of a body with files and form fields."""
 MAX_HEAD_BYTES = 16 * KIB
 MAX_BOUNDARY_BYTES = 70
 """Greatest length of a boundary (RFC 2046, section 5.1.1)."""
@@ -39,14 +41,14 @@ def boundary_of(content_type: str) -> bytes:
     too long.
     """
     media_type, parameters = parse_options_header(content_type)
-    if media_type != b"multipart/form-data":
+    if media_type != FORM.encode():
         raise UnsupportedMediaTypeProblem(
-            f"Files must be sent with the Content-Type multipart/form-data; this request has {content_type or 'none'}."
+            f"Files must be sent with the Content-Type {FORM}; this request has {content_type or 'none'}."
         )
     boundary = parameters.get(b"boundary", b"")
     if not 0 < len(boundary) <= MAX_BOUNDARY_BYTES:
         raise BadRequestProblem(
-            f"The Content-Type multipart/form-data needs a boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.",
+            f"The Content-Type {FORM} needs a boundary of 1 to {MAX_BOUNDARY_BYTES} bytes.",
             code="bad-multipart",
         )
     return boundary

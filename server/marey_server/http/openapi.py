@@ -16,6 +16,7 @@ from marey_schemas.names import DIGEST_PATTERN
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM_TYPE
 from marey_server.http.declarations import Access, Bytes, Document, Files, Operation, RequestBody, conditions_of
 from marey_server.http.examples import curl_command, example_of
+from marey_server.http.multipart import FORM
 from marey_server.http.negotiation import DOCUMENT_FORMS
 from marey_server.http.openapi_models import REF, ApiModels, Schema, bytes_schema, form_schema, without_null
 from marey_server.http.routes import Route
@@ -201,7 +202,7 @@ def _request_body(body: RequestBody, models: ApiModels) -> Schema:
         content[OCTETS] = {"schema": bytes_schema(OCTETS)}
     elif body.content is Files:
         assert body.fields is not None
-        content["multipart/form-data"] = {"schema": form_schema(body.fields)}
+        content[FORM] = {"schema": form_schema(body.fields)}
     else:
         schema = models.document() if body.content is Document else models.reading(cast(type[BaseModel], body.content))
         content |= {name: {"schema": schema} for name in MEDIA_TYPES}
