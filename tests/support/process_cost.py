@@ -35,6 +35,13 @@ class ProcessCost:
         """Return the resident memory of the process and its children in MB."""
         return sum(self._status_kb(pid, "VmRSS") for pid in self._family()) / 1e3
 
+    def proportional_mb(self) -> float:
+        """Return the memory of the process and its children in MB; of a page that n processes share, each counts 1/n.
+
+        Children of a fork server share some 300 MB with it, which `resident_mb` counts again for every child.
+        """
+        return sum(_listed_kb(Path(f"/proc/{pid}/smaps_rollup"), "Pss") for pid in self._family()) / 1e3
+
     def own_resident_mb(self) -> float:
         """Return the resident memory of the process without its children in MB."""
         return self._status_kb(self.pid, "VmRSS") / 1e3
@@ -76,11 +83,16 @@ class ProcessCost:
 
     @staticmethod
     def _status_kb(pid: int, name: str) -> int:
-        with contextlib.suppress(OSError):
-            for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-                if line.startswith(f"{name}:"):
-                    return int(line.split()[1])
-        return 0
+        return _listed_kb(Path(f"/proc/{pid}/status"), name)
+
+
+def _listed_kb(table: Path, name: str) -> int:
+    """Return an amount from a table such as `/proc/<pid>/status`, and 0 if the process has ended."""
+    with contextlib.suppress(OSError):
+        for line in table.read_text().splitlines():
+            if line.startswith(f"{name}:"):
+                return int(line.split()[1])
+    return 0
 
 
 def _fields(stat: Path) -> list[str]:

@@ -217,7 +217,7 @@ def _read_memory(made: Installation, record: Record, stopping: threading.Event) 
     while not stopping.wait(SAMPLE_EVERY_S):
         for name, cost in costs.items():
             at = time.monotonic() - begun
-            record.memory[name].append((at, cost.resident_mb()))
+            record.memory[name].append((at, cost.proportional_mb()))
             record.memory[f"{name} without its children"].append((at, cost.own_resident_mb()))
 
 
