@@ -11,10 +11,10 @@ from pydantic import ValidationError
 from marey_motion import documents
 from marey_motion.alignment.aligned import AlignedSet
 from marey_motion.alignment.aligned_documents import StoredExample, set_from_examples, uid_of
+from marey_motion.errors import MappingError
 from marey_motion.modelling.primitive_documents import trained_to_tree
 from marey_motion.modelling.search.check import SearchCheck, check_search
 from marey_motion.modelling.training import TrainedPrimitive, train_primitive
-from marey_motion.rigs import map_joints
 from marey_reports.models.figures import ModelSubject, draw_alignment_figures, draw_model_figures
 from marey_reports.models.page import render_model_report
 from marey_schemas.documents.alignments import AlignmentInfo
@@ -29,6 +29,7 @@ from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
 from marey_schemas.wording import first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
+from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 from marey_worker.job_io.stored_reports import inputs_of, store_report
 
 
@@ -56,7 +57,8 @@ def run(context: Context, params: ModelParams) -> dict[str, Any]:
     parts = {"model": tree}
     if params.report:
         context.progress(0, None, "writing the report")
-        parts["report"] = write_model_report(context, trained, aligned, origin, params)
+        check = _checked(context, trained, aligned, skeleton) if params.search_check else None
+        parts["report"] = write_model_report(context, trained, aligned, origin, check)
     context.stage(
         [StagedOutput(name=params.name, kind=Kind.MODEL, item_name=params.name, tags=params.tags, parts=parts)]
     )
@@ -131,7 +133,11 @@ def _provenance(
 
 
 def write_model_report(
-    context: Context, trained: TrainedPrimitive, aligned: AlignedSet, origin: Mapping[str, Any], params: ModelParams
+    context: Context,
+    trained: TrainedPrimitive,
+    aligned: AlignedSet,
+    origin: Mapping[str, Any],
+    check: SearchCheck | None,
 ) -> dict[str, Any]:
     """Draw the figures of a model and of its alignment, and write the report page with them.
 
@@ -140,17 +146,20 @@ def write_model_report(
     Parameters
     ----------
     origin : field `provenance` of the part `model`: the clips, reference and seed from which the model was trained
+    check : errors of searches for targets that examples reached; None: the page shows none
     """
     title = trained.primitive.name
-    check = _checked(context, trained, aligned) if params.search_check else None
     subject = ModelSubject(trained.primitive, aligned, trained.report, check, context.seed)
     figures = {**draw_alignment_figures(aligned), **draw_model_figures(subject)}
     page = render_model_report(trained, subject, figures, title=title, origin=origin, inputs=inputs_of(context))
     return store_report(context, ModelReport, title, page, ((None, figure) for figure in figures.values()))
 
 
-def _checked(context: Context, trained: TrainedPrimitive, aligned: AlignedSet) -> SearchCheck | None:
+def _checked(context: Context, trained: TrainedPrimitive, aligned: AlignedSet, ref: RevisionRef) -> SearchCheck | None:
     context.progress(0, None, "searching for targets that the examples reached")
-    skeleton = aligned.skeleton
-    joints = {standard: skeleton.index_of(name) for standard, name in map_joints(skeleton).joints.items()}
+    try:
+        mapped = read_mapped(context, Rig.as_stored(ref))
+    except MappingError:  # a model needs no joint mapping, but without one hands and feet are unknown
+        return None
+    joints = {standard: mapped.skeleton.index_of(name) for standard, name in mapped.mapping.joints.items()}
     return check_search(aligned, joints, trained.options, seed=context.seed)
