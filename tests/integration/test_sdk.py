@@ -132,6 +132,10 @@ def test_arrays_are_those_of_the_library_and_only_what_is_asked_for_is_read(
     assert clip.rotations(joints="Hips", frames=slice(0, 2)).shape == (2, 1, 4)
     with pytest.raises(ValueError, match="frames are counted from 0"):
         clip.velocities(frames=slice(0, -5))
+    for frames in (slice(clip.frames, None), slice(50, 50)):
+        for method in (clip.positions, clip.velocities, clip.contacts):
+            with pytest.raises(marey.MareyError, match="frames"):
+                method(frames=frames)
     with pytest.raises(NoSuchJoint, match="did you mean 'LeftHand'"):
         clip.positions(joints="lefthand")
 

@@ -93,7 +93,8 @@ def mv(
         def move(target: FolderOrItem) -> Any:
             was = target.place
             moved = target.move(folder, name or was.rpartition("/")[2])
-            print_message(f"{was} is moved to {to.project}/{moved.path}")
+            place = f"{to.project}/{moved.path}"
+            print_message(f"{was} is moved to {place}" if place != was else f"{was} is already there")
             return moved
 
         _do_each(targets, move, "moved", as_json)

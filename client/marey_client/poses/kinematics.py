@@ -151,10 +151,15 @@ def read_contacts(clip: PosedItem, frames: slice | None) -> NDArray[np.bool_]:
 
 
 def _widened(clip: PosedItem, frames: slice | None, more: int) -> tuple[slice | None, slice]:
-    """Return a range of frames extended by `more` on both sides, and the given range as a slice of the extended one."""
+    """Return a range of frames extended by `more` on both sides, and the given range as a slice of the extended one.
+
+    A range without frames of the motion is returned as it is, so that reading it is refused.
+    """
     frames_text(frames)  # refuses other steps and negative bounds
     if frames is None:
         return None, slice(None)
     first, end = frames.start or 0, clip.frames if frames.stop is None else min(frames.stop, clip.frames)
+    if first >= end:
+        return frames, slice(None)
     start = max(0, first - more)
     return slice(start, end + more), slice(first - start, end - start)

@@ -104,6 +104,7 @@ def clips(lab: ProjectHandle) -> list[str]:
 def test_items_and_folders_are_renamed_and_moved_with_their_ids(run: Command, lab: ProjectHandle) -> None:
     ids = {clip.name: clip.id for clip in lab.clips.list()}
     assert "lab/raw/a is moved to lab/raw/walk" in run("mv", "lab/raw/a", "lab/raw/walk").stderr
+    assert "lab/raw/walk is already there" in run("mv", "lab/raw/walk", "lab/raw/walk").stderr
     assert lab.clips.get(ids["a"]).path == "raw/walk"
     run("mv", "lab/raw/b", f"lab/{ids['c']}", "lab/takes/day-1/")  # made, as it is not there
     assert clips(lab) == ["raw/walk", "takes/day-1/b", "takes/day-1/c"]
