@@ -16,7 +16,8 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 from pydantic import BaseModel, ValidationError
 
 from marey_client.errors import BadArgument
-from marey_schemas.wording import first_reason, one_of
+from marey_schemas.validation.reasons import first_reason
+from marey_schemas.wording import one_of
 
 Model = TypeVar("Model", bound=BaseModel)
 Owner = TypeVar("Owner", bound=Callable[..., Any])

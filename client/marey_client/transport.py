@@ -28,7 +28,7 @@ from marey_schemas.encoding.codecs import JSON, CodecError, decode_tree, encode_
 from marey_schemas.encoding.compression import LEAST_BYTES_COMPRESSED, ZSTD, compress
 from marey_schemas.problems import MEDIA_TYPE as PROBLEM
 from marey_schemas.problems import Problem
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 
 Model = TypeVar("Model", bound=BaseModel)
 T = TypeVar("T")

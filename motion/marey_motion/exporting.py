@@ -21,7 +21,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.formats import DEFAULT_UNIT, format_named
 from marey_schemas.item_files import ItemToExport
 from marey_schemas.options.exporting import MotionFileOptions
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 
 _CHANNELS: TypeAdapter[tuple[tuple[str, ...], ...]] = TypeAdapter(tuple[tuple[str, ...], ...])
 

@@ -11,9 +11,13 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from marey_schemas.problems import FieldError
-from marey_schemas.wording import misspelt_first, plain_reason, steps_in
+from marey_schemas.validation.faults import steps_in, telling_faults
+from marey_schemas.validation.reasons import plain_reason
 
 MAX_ERRORS = 50
+"""Greatest number of errors that are returned."""
+MOST_READ = 1000
+"""Greatest number of pydantic's errors among which those are chosen; a byte of a request can cause several."""
 
 
 def json_pointer(steps: Sequence[str]) -> str:
@@ -31,14 +35,11 @@ def field_errors(
     pydantic counts only the valid items of a list. So if an item is invalid, pydantic may also report that the list is
     too short. Such a report is left out.
     """
-    entries = misspelt_first(error.errors(include_url=False))
+    entries = telling_faults(tree, error.errors(include_url=False)[:MOST_READ])
     wrong = {entry["loc"][:length] for entry in entries for length in range(len(entry["loc"]))}
     entries = [entry for entry in entries if entry["type"] != "too_short" or entry["loc"] not in wrong]
-    return [
-        FieldError(
-            pointer=pointer(steps_in(tree, entry)),
-            code=entry["type"].replace("_", "-"),
-            detail=plain_reason(entry, model),
-        )
+    found = {
+        (pointer(steps_in(tree, entry)), plain_reason(entry, model)): entry["type"].replace("_", "-")
         for entry in entries[:MAX_ERRORS]
-    ]
+    }
+    return [FieldError(pointer=place, code=code, detail=reason) for (place, reason), code in found.items()]

@@ -23,7 +23,7 @@ from marey_schemas.processes.memory import loading_modules
 from marey_schemas.queue.job_kinds import find_kind
 from marey_schemas.queue.kind_declaration import KindDeclaration
 from marey_schemas.queue.worker_protocol import LONGEST_CODE, LONGEST_DETAIL
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_worker import signatures
 from marey_worker.context import Context, JobRefused, Unreadable
 from marey_worker.messages import BAD_RESULT, UNPACKABLE, Done, End, Failed, Run, pack, unpack

@@ -15,7 +15,7 @@ from marey_client.errors import BadSidecar
 from marey_schemas.datasets.exports import EXPORT_SCHEMA, SIDECAR, ExportedClip, ExportedFolder
 from marey_schemas.documents.clips import TakeRecord
 from marey_schemas.encoding.canonical import canonical_json
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 
 MOST_SIDECAR_BYTES = 1 << 30
 RECORDS = "records.csv"

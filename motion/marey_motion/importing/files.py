@@ -38,7 +38,7 @@ from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.imports import ImportEntry, Refusal, refused_entry, skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.names import base_name
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 
 _LONGEST_COLLECTION = 1024
 _LONGEST_MESSAGE = 4000

@@ -18,7 +18,7 @@ from marey_schemas.documents.graphs import ModelGraph
 from marey_schemas.documents.originals import original_of
 from marey_schemas.imports import NO_MODEL
 from marey_schemas.kinds import Kind
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 
 SCHEMA = "marey/model-graph@1"
 FEW = 3

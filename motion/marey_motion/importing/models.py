@@ -38,7 +38,7 @@ from marey_schemas.formats.companions import is_skeleton_name, model_name
 from marey_schemas.imports import skeleton_output
 from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import TreeOptions
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 
 MOST_NAMED = 5
 """Greatest number of places in a file that a warning names."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_server.capacity.costs import MEASURED, JobCosts, MeasuredCosts, UnusableCosts
 from marey_server.capacity.needs import PlannedWork, compute_needs
 from marey_server.capacity.simulation import SimulatedJob, simulate

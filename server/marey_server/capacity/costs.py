@@ -11,7 +11,7 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_server.capacity.simulation import QueueCosts, RequestCosts
 
 MEASURED = Path(__file__).with_name("measured_costs.toml")

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from marey_schemas.queue.log_lines import LogForm
-from marey_schemas.wording import plain_reason
+from marey_schemas.validation.reasons import plain_reason
 from marey_server.process.data_folder import worker_token_file
 
 ENTRY_POINTS = "marey.launchers"

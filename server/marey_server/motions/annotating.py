@@ -15,7 +15,7 @@ from marey_schemas.items import ItemCreate
 from marey_schemas.kinds import Kind
 from marey_schemas.names import MAX_NAME_LENGTH, base_name
 from marey_schemas.problems import FieldError
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_server.errors import ApiProblem, InvalidProblem, TooLargeProblem
 from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.motions.loading import LOADING

@@ -32,7 +32,7 @@ from marey_schemas.encoding.digests import digest_of_hash
 from marey_schemas.kinds import Kind
 from marey_schemas.options.evaluation import MOST_FRAME_RATE_HZ
 from marey_schemas.problems import FieldError
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_server.errors import InvalidProblem, NotFoundProblem
 from marey_server.motions.child import Message, pack_tree, unpack_tree
 from marey_server.store import items, projects

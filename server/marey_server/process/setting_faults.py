@@ -13,7 +13,8 @@ from pydantic import ValidationError
 from pydantic_settings.exceptions import SettingsError
 
 from marey_schemas.address import SETTINGS_FILE
-from marey_schemas.wording import nearest, plain_reason
+from marey_schemas.validation.reasons import plain_reason
+from marey_schemas.wording import nearest
 from marey_server.process.settings import PREFIX, Settings
 
 _JSON_FORMS = """write a list as ["a", "b"], and an object as {"a": "b"}"""

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ValidationError
 from marey_schemas.editing.commands import Resample, Trim
 from marey_schemas.editing.edits import EditDocument
 from marey_schemas.problems import FieldError
+from marey_schemas.queue.jobs import JobCreate
 from marey_server.errors import InvalidProblem
 from marey_server.field_errors import MAX_ERRORS, field_errors, json_pointer
 from marey_server.prepared_documents import prepare_document
@@ -54,3 +55,23 @@ def test_a_list_is_too_short_only_if_it_is_so_in_the_document() -> None:
 
 def test_only_so_many_faults_are_told() -> None:
     assert len(told(Trim, {"command": "trim", **{f"f{number}": 1 for number in range(100)}})) == MAX_ERRORS
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("raw", {"": ["the value must be an object with named fields", "the value must be a list"]}),
+        ({"colection": "raw"}, {"/colection": ["there is no field of this name; did you mean 'collection'?"]}),
+        ({"item": "clip_1", "revision": "two"}, {"/revision": ["the value must be a whole number"]}),
+        ([{"item": "clip_1"}, 3], {"/1": ["the value must be an object with named fields"]}),
+        (
+            {"item": "clip_1", "job": "job_1"},
+            {field: ["this field cannot be combined with the others of this object"] for field in ("/item", "/job")},
+        ),
+    ],
+)
+def test_of_the_types_of_a_value_only_the_likeliest_counts(given: Any, expected: dict[str, list[str]]) -> None:
+    found: dict[str, list[str]] = {}
+    for fault in told(JobCreate, {"kind": "retarget", "inputs": {"clips": given}}):
+        found.setdefault(fault.pointer.removeprefix("/inputs/clips"), []).append(fault.detail)
+    assert found == expected

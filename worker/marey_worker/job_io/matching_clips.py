@@ -31,7 +31,8 @@ from marey_schemas.lru import LruCache
 from marey_schemas.options.matching import DatabaseOptions
 from marey_schemas.queue.job_params import EvaluateParams
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_schemas.wording import counted, first_reason, listed
+from marey_schemas.validation.reasons import first_reason
+from marey_schemas.wording import counted, listed
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.skeleton_cache import Rig, read_mapped
 

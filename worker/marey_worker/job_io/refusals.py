@@ -9,7 +9,8 @@ from pydantic import ValidationError
 from marey_motion.errors import MotionError
 from marey_schemas.queue.jobs import NOTHING_DONE
 from marey_schemas.queue.worker_protocol import PinnedInput
-from marey_schemas.wording import counted, first_reason
+from marey_schemas.validation.reasons import first_reason
+from marey_schemas.wording import counted
 from marey_worker.context import Context, JobRefused, NoSuchThing, Unreadable
 
 UNUSABLE = (MotionError, ValidationError, Unreadable)

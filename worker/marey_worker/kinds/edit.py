@@ -21,7 +21,7 @@ from marey_schemas.editing.edits import EditDocument
 from marey_schemas.kinds import Kind
 from marey_schemas.queue.job_params import EditParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.refusals import UNUSABLE, Refusals, present
 from marey_worker.job_io.result_places import ResultPlaces

@@ -26,7 +26,7 @@ from marey_schemas.kinds import Kind
 from marey_schemas.options.modelling import ModelOptions
 from marey_schemas.queue.job_params import ModelParams
 from marey_schemas.queue.worker_protocol import PinnedInput, StagedOutput
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_worker.context import Context, JobRefused
 from marey_worker.job_io.matching_clips import refusing_motion_errors
 from marey_worker.job_io.skeleton_cache import Rig, read_mapped

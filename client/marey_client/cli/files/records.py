@@ -14,7 +14,8 @@ from marey_client.cli.terminal.failures import Refused, WrongUsage, sentence
 from marey_client.cli.terminal.invocation import QueryText, connect
 from marey_client.cli.terminal.output import print_message
 from marey_client.progress import progress
-from marey_schemas.wording import counted, plain_reason
+from marey_schemas.validation.reasons import plain_reason
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

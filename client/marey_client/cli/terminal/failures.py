@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from marey_schemas.address import ADMIN_TOKEN_FILE
-from marey_schemas.wording import first_reason, plain_reason, printable
+from marey_schemas.validation.reasons import first_reason, plain_reason
+from marey_schemas.wording import printable
 
 FAILED, WRONG_USAGE = 1, 2
 INTERRUPTED = 130

@@ -15,7 +15,8 @@ from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.output import print_json, print_message, print_refused
 from marey_client.cli.terminal.schema_options import Chosen, OptionsOf
 from marey_client.progress import progress, show_progress
-from marey_schemas.wording import counted, plain_reason
+from marey_schemas.validation.reasons import plain_reason
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.marey import Marey

@@ -31,7 +31,7 @@ from marey_client.cli.terminal.typed_values import (
     read_numbers,
     without_null,
 )
-from marey_schemas.wording import plain_reason
+from marey_schemas.validation.reasons import plain_reason
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -16,7 +16,7 @@ from sqlalchemy import Row, and_, insert, select, update
 from marey_schemas.queue.job_kinds import UnknownKindError, kind_of_job
 from marey_schemas.queue.jobs import FailureReason, InputSpec
 from marey_schemas.queue.kind_declaration import KindDeclaration
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_server import faults
 from marey_server.errors import QuotaExceededProblem
 from marey_server.store.jobs import commits, layout, result_cache

@@ -14,7 +14,7 @@ from sqlalchemy import Row, select, update
 
 from marey_schemas.access import Role
 from marey_schemas.queue.jobs import JobCreate
-from marey_schemas.wording import first_reason
+from marey_schemas.validation.reasons import first_reason
 from marey_server.access import scopes
 from marey_server.access.principal import SYSTEM, Principal
 from marey_server.access.roles import RequiredRole
