@@ -10,9 +10,10 @@ import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import httpx
@@ -38,6 +39,8 @@ SETTLING_S = 300.0
 """Seconds after which the growth of the memory is measured; in a short trial, after a third of its duration."""
 SENDERS = 24
 SHOTS = 2_000
+"""Number of hostile requests to choose from. All are sent once before the trial, because the first one of each sort
+pays for what the server builds once; at 2 requests per second, this would look like growth for a quarter of an hour."""
 ATTACKERS = ("contributor", "stranger")
 """Callers who send hostile requests; the requests of all callers would take gigabytes of memory."""
 SAMPLE_EVERY_S = 2.0
@@ -88,6 +91,7 @@ def run(trial: LoadTrial, say: Say) -> list[str]:
         lease = start_attempt(house.people, house.tokens, house.variables["item"])
         made.begin_work()
         record = Record()
+        visitors.warm_up(record)
         say(f"{trial.rate:g} requests per second for {trial.minutes:g} minutes")
         with _measuring(made, house, lease, record):
             visitors.visit(arrival_times(trial.rate, 60 * trial.minutes, trial.seed), record)
@@ -112,18 +116,29 @@ class Visitors:
             lab = marey.create_project(ProjectCreate(name="load"))
             self._rigs = [lab.skeletons.create(f"rig {n}", {"hierarchy": skeleton_tree()}).id for n in range(20)]
         hostile = some(shots(house, ATTACKERS), SHOTS, draw.randrange(1 << 32))
-        small = [one for one in hostile if not one.route.endswith(ENDS_CREDENTIALS) and len(one.data) <= SMALL_BYTES]
-        self._shots = itertools.cycle(small)
+        self._hostile = [
+            one for one in hostile if not one.route.endswith(ENDS_CREDENTIALS) and len(one.data) <= SMALL_BYTES
+        ]
+
+    def warm_up(self, record: Record) -> None:
+        """Send each hostile request once."""
+        with ThreadPoolExecutor(SENDERS) as pool:
+            for _ in pool.map(partial(self._send_hostile, record), self._hostile):
+                pass
 
     def visit(self, times_s: list[float], record: Record) -> None:
         """Send a request at each of the times; the wait for an answer counts from that time."""
         begun = time.monotonic()
         sorts = self._draw.choices(list(SHARES), list(SHARES.values()), k=len(times_s))
+        hostile = itertools.cycle(self._hostile)
+        sent: list[Future[None]] = []
         with ThreadPoolExecutor(SENDERS) as pool, ThreadPoolExecutor(SENDERS) as slow_pool:
             for after_s, sort in zip(times_s, sorts, strict=True):
                 time.sleep(max(0.0, begun + after_s - time.monotonic()))
                 senders = slow_pool if sort == "hostile" else pool
-                senders.submit(self._send, sort, begun + after_s, record, next(self._shots))
+                sent.append(senders.submit(self._send, sort, begun + after_s, record, next(hostile)))
+        for one in sent:
+            one.result()
 
     def unfinished_jobs(self) -> list[str]:
         """Wait until the jobs have ended; return those that have not succeeded."""
@@ -134,8 +149,7 @@ class Visitors:
 
     def _send(self, sort: str, planned: float, record: Record, shot: Shot) -> None:
         if sort == "hostile":
-            if fault := asyncio.run(fire(self._made.servers[0].url, shot)).fault:
-                record.faults[f"hostile: {fault}"] += 1
+            self._send_hostile(record, shot)
         else:
             try:
                 answer = getattr(self, f"_{sort}")(self._client())
@@ -144,6 +158,10 @@ class Visitors:
             except httpx.TransportError as error:
                 record.faults[f"{sort}: {error!r}"] += 1
         record.waits_s[sort].append(time.monotonic() - planned)
+
+    def _send_hostile(self, record: Record, shot: Shot) -> None:
+        if fault := asyncio.run(fire(self._made.servers[0].url, shot)).fault:
+            record.faults[f"hostile: {fault}"] += 1
 
     def _client(self) -> httpx.Client:
         if not hasattr(self._own, "client"):
