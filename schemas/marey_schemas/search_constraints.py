@@ -6,10 +6,9 @@ and weighted before the errors of several constraints are added up.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal, LiteralString, Self, TypeVar
+from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from marey_schemas.base import Tagged
 from marey_schemas.names import Label
@@ -36,19 +35,15 @@ _Target = TypeVar("_Target", bound=tuple[float | None, ...])
 _Vector = TypeVar("_Vector", bound=tuple[float, ...])
 
 
-def _invalid(message: LiteralString) -> PydanticCustomError:
-    return PydanticCustomError("constraint_invalid", message)
-
-
 def _require_coordinate(target: _Target) -> _Target:
     if all(coordinate is None for coordinate in target):
-        raise _invalid("give at least one coordinate of the target position")
+        raise ValueError("give at least one coordinate of the target position")
     return target
 
 
 def _require_length(vector: _Vector) -> _Vector:
     if not any(abs(component) > 1e-9 for component in vector):
-        raise _invalid("at least one component must not be zero")
+        raise ValueError("at least one component must not be zero")
     return vector
 
 
@@ -118,7 +113,7 @@ class LookDirectionConstraint(_AngularConstraint):
     @model_validator(mode="after")
     def _check_target(self) -> Self:
         if (self.direction is None) == (self.point_m is None):
-            raise _invalid("give exactly one of direction and point_m")
+            raise ValueError("give exactly one of direction and point_m")
         return self
 
 

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 
 from marey_schemas.search import SearchRequest
 from marey_schemas.search_constraints import RootPositionConstraint
+from marey_schemas.validation.reasons import first_reason
 
 AHEAD = {"type": "root_position", "at": "end", "target_m": [0.0, 1.0]}
 
@@ -41,23 +42,38 @@ LOOK = {**HEAD, "type": "look_direction"}
 
 
 @pytest.mark.parametrize(
-    ("constraint", "place"),
+    ("constraint", "reason"),
     [
-        ({**AHEAD, "target_m": [None, None]}, ("target_m",)),
-        ({**HEAD, "type": "joint_position", "target_m": [None, None, None]}, ("target_m",)),
-        ({**HEAD, "type": "joint_orientation", "rotation": [0, 0, 0, 0]}, ("rotation",)),
-        ({**LOOK, "direction": [0, 0, 1], "axis": [0, 0, 0]}, ("axis",)),
-        (LOOK, ()),
-        ({**LOOK, "direction": [0, 0, 1], "point_m": [0, 0, 1]}, ()),
+        (
+            {**AHEAD, "target_m": [None, None]},
+            "constraints.0.target_m: give at least one coordinate of the target position",
+        ),
+        (
+            {**HEAD, "type": "joint_position", "target_m": [None, None, None]},
+            "constraints.0.target_m: give at least one coordinate of the target position",
+        ),
+        (
+            {**HEAD, "type": "joint_orientation", "rotation": [0, 0, 0, 0]},
+            "constraints.0.rotation: at least one component must not be zero",
+        ),
+        (
+            {**LOOK, "direction": [0, 0, 1], "axis": [0, 0, 0]},
+            "constraints.0.axis: at least one component must not be zero",
+        ),
+        (LOOK, "constraints.0: give exactly one of direction and point_m"),
+        (
+            {**LOOK, "direction": [0, 0, 1], "point_m": [0, 0, 1]},
+            "constraints.0: give exactly one of direction and point_m",
+        ),
     ],
 )
-def test_a_constraint_without_a_meaning_is_refused_at_its_place(
-    constraint: dict[str, object], place: tuple[str, ...]
+def test_a_constraint_without_a_meaning_is_refused_at_its_place_with_the_reason(
+    constraint: dict[str, object], reason: str
 ) -> None:
+    request = {"constraints": [constraint]}
     with pytest.raises(ValidationError) as caught:
-        SearchRequest.model_validate({"constraints": [constraint]})
-    (error,) = caught.value.errors()
-    assert (error["loc"], error["type"]) == (("constraints", 0, constraint["type"], *place), "constraint_invalid")
+        SearchRequest.model_validate(request)
+    assert first_reason(caught.value, SearchRequest, request) == reason
 
 
 def test_a_constraint_in_a_request_has_a_type_which_python_adds() -> None:
