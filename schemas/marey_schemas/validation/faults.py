@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from marey_schemas.wording import one_of
+
 _OF_FITTING_TYPE = frozenset(("value_error", "assertion_error"))
 """Kinds of faults that a validator of ours found in a value whose type is right."""
 
@@ -15,9 +17,13 @@ def telling_faults(document: Any, faults: Sequence[Any]) -> list[Any]:
     `faults` are the entries of `ValidationError.errors()`. For a value that can have several types, pydantic reports
     what each of the types would need. Only the faults of the type that the value resembles most are returned; if it
     resembles several types equally, the faults that these have in common, or all of them if they have none in common.
+    If each of them lacks another field, one fault names these fields.
     """
-    likely = {id(fault) for fault in _likely_faults(document, faults, 0)}
-    return misspelt_first([fault for fault in faults if id(fault) in likely])
+    order: dict[Any, int] = {}
+    for index, fault in enumerate(faults):
+        for length in range(len(fault["loc"]) + 1):
+            order.setdefault(fault["loc"][:length], index)
+    return misspelt_first(sorted(_likely_faults(document, faults, 0), key=lambda one: order[one["loc"]]))
 
 
 def misspelt_first(faults: Sequence[Any]) -> list[Any]:
@@ -84,7 +90,18 @@ def _of_likeliest_type(types: Sequence[list[Any]], depth: int) -> list[Any]:
     common = set.intersection(*alike) if alike else set()
     if common:
         return [one for one in likeliest[0] if _identity(one, depth) in common]
+    lacking = [
+        one for faults in likeliest for one in faults if one["type"] == "missing" and len(one["loc"]) == depth + 2
+    ]
+    if len(lacking) == len(likeliest) == sum(map(len, likeliest)) > 1:
+        return [_lacking_one_of(lacking, depth)]
     return [one for faults in likeliest for one in faults]
+
+
+def _lacking_one_of(lacking: Sequence[Any], depth: int) -> Any:
+    """Return the fault of an object that needs one of several fields, from the faults about each of the fields."""
+    fields = one_of([repr(one["loc"][-1]) for one in lacking])
+    return {**lacking[0], "type": "value_error", "loc": lacking[0]["loc"][:depth], "msg": f"Value error, give {fields}"}
 
 
 def _identity(fault: Mapping[str, Any], depth: int) -> tuple[Any, ...]:

@@ -61,6 +61,8 @@ def test_only_so_many_faults_are_told() -> None:
     ("given", "expected"),
     [
         ("raw", {"": ["the value must be an object with named fields", "the value must be a list"]}),
+        ({}, {"": ["give 'item', 'collection', 'dataset' or 'job'"]}),
+        ([{"item": "clip_1"}, {}], {"/1": ["give 'item', 'collection', 'dataset' or 'job'"]}),
         ({"colection": "raw"}, {"/colection": ["there is no field of this name; did you mean 'collection'?"]}),
         ({"item": "clip_1", "revision": "two"}, {"/revision": ["the value must be a whole number"]}),
         ([{"item": "clip_1"}, 3], {"/1": ["the value must be an object with named fields"]}),
