@@ -32,14 +32,19 @@ def field_errors(
 
     `pointer` converts the location of an error to text.
 
+    If a value fits none of several types, one error has the reasons of all of them; the code belongs to the first.
+
     pydantic counts only the valid items of a list. So if an item is invalid, pydantic may also report that the list is
     too short. Such a report is left out.
     """
     entries = telling_faults(tree, error.errors(include_url=False)[:MOST_READ])
     wrong = {entry["loc"][:length] for entry in entries for length in range(len(entry["loc"]))}
     entries = [entry for entry in entries if entry["type"] != "too_short" or entry["loc"] not in wrong]
-    found = {
-        (pointer(steps_in(tree, entry)), plain_reason(entry, model)): entry["type"].replace("_", "-")
-        for entry in entries[:MAX_ERRORS]
-    }
-    return [FieldError(pointer=place, code=code, detail=reason) for (place, reason), code in found.items()]
+    found: dict[str, dict[str, str]] = {}
+    for entry in entries[:MAX_ERRORS]:
+        reasons = found.setdefault(pointer(steps_in(tree, entry)), {})
+        reasons.setdefault(plain_reason(entry, model), entry["type"].replace("_", "-"))
+    return [
+        FieldError(pointer=place, code=next(iter(reasons.values())), detail="; or ".join(reasons))
+        for place, reasons in found.items()
+    ]

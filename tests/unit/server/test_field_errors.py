@@ -60,7 +60,7 @@ def test_only_so_many_faults_are_told() -> None:
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        ("raw", {"": ["the value must be an object with named fields", "the value must be a list"]}),
+        ("raw", {"": ["the value must be an object with named fields; or the value must be a list"]}),
         ({}, {"": ["give 'item', 'collection', 'dataset' or 'job'"]}),
         ([{"item": "clip_1"}, {}], {"/1": ["give 'item', 'collection', 'dataset' or 'job'"]}),
         ({"colection": "raw"}, {"/colection": ["there is no field of this name; did you mean 'collection'?"]}),
