@@ -19,9 +19,9 @@ def telling_faults(document: Any, faults: Sequence[Any]) -> list[Any]:
     resembles several types equally, the faults that these have in common, or all of them if they have none in common.
     If each of them lacks another field, one fault names these fields.
     """
-    order: dict[Any, int] = {}
+    order = {fault["loc"]: index for index, fault in reversed(list(enumerate(faults)))}
     for index, fault in enumerate(faults):
-        for length in range(len(fault["loc"]) + 1):
+        for length in range(len(fault["loc"])):  # the places of faults that name the fields that types lack
             order.setdefault(fault["loc"][:length], index)
     return misspelt_first(sorted(_likely_faults(document, faults, 0), key=lambda one: order[one["loc"]]))
 

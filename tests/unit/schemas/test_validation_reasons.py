@@ -7,6 +7,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, TypeAdapter, ValidationError
 
 import marey_schemas
+from marey_schemas.editing.edits import EditDocument
 from marey_schemas.names import FORMS, CollectionPath, ItemName, ProjectName, ReceivingPath, Tag, UserName
 from marey_schemas.validation.reasons import first_reason, plain_reason
 
@@ -101,6 +102,14 @@ def test_a_value_that_fits_no_type_of_a_union_gets_the_reasons_of_all() -> None:
         Found.model_validate({"at": []})
     reason = first_reason(refused.value, Found, {"at": []})
     assert reason == "at: the value must be a whole number; or the value must be 'end'"
+
+
+def test_the_fault_of_an_entry_is_reported_before_a_list_without_valid_entries() -> None:
+    given = {"schema": "marey/edit@1", "commands": [{"command": "trim", "start": 5, "stop": 2}]}
+    with pytest.raises(ValidationError) as refused:
+        EditDocument.model_validate(given)
+    reason = first_reason(refused.value, EditDocument, given)
+    assert reason == "commands.0: the stop, frame 2, must be after the start, frame 5"
 
 
 def test_every_pattern_of_a_text_has_an_explanation_in_words() -> None:
