@@ -40,11 +40,12 @@ def field_errors(
     entries = telling_faults(tree, error.errors(include_url=False)[:MOST_READ])
     wrong = {entry["loc"][:length] for entry in entries for length in range(len(entry["loc"]))}
     entries = [entry for entry in entries if entry["type"] != "too_short" or entry["loc"] not in wrong]
-    found: dict[str, dict[str, str]] = {}
+    found: dict[tuple[str, bool], dict[str, str]] = {}
     for entry in entries[:MAX_ERRORS]:
-        reasons = found.setdefault(pointer(steps_in(tree, entry)), {})
+        of_key = entry["loc"][-1:] == ("[key]",)  # a name in an object; its value can have a fault, too
+        reasons = found.setdefault((pointer(steps_in(tree, entry)), of_key), {})
         reasons.setdefault(plain_reason(entry, model), entry["type"].replace("_", "-"))
     return [
         FieldError(pointer=place, code=next(iter(reasons.values())), detail="; or ".join(reasons))
-        for place, reasons in found.items()
+        for (place, _), reasons in found.items()
     ]

@@ -1,9 +1,9 @@
 """Errors of fields: the same form for request bodies, documents, and parameters of jobs."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from marey_schemas.editing.commands import Resample, Trim
 from marey_schemas.editing.edits import EditDocument
@@ -77,3 +77,14 @@ def test_of_the_types_of_a_value_only_the_likeliest_counts(given: Any, expected:
     for fault in told(JobCreate, {"kind": "retarget", "inputs": {"clips": given}}):
         found.setdefault(fault.pointer.removeprefix("/inputs/clips"), []).append(fault.detail)
     assert found == expected
+
+
+class Lengths(BaseModel):
+    lengths_m: dict[Annotated[str, Field(max_length=2)], int]
+
+
+def test_a_name_and_its_value_have_errors_of_their_own() -> None:
+    assert [(fault.pointer, fault.code) for fault in told(Lengths, {"lengths_m": {"long": "x"}})] == [
+        ("/lengths_m/long", "string-too-long"),
+        ("/lengths_m/long", "int-parsing"),
+    ]
