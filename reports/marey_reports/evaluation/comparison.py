@@ -26,7 +26,7 @@ from marey_schemas.documents.evaluations import CONFIDENCE
 from marey_schemas.documents.replicates import LEAST_REPLICATES
 from marey_schemas.documents.worst_first import increase, worst_first
 from marey_schemas.options.verdict import VerdictLimits
-from marey_schemas.wording import counted
+from marey_schemas.wording import counted, listed
 
 Figures = Mapping[str, DrawnFigure]
 
@@ -34,8 +34,11 @@ MOST_TRIALS = 10
 LEAST_SHIFT_M = 0.005  # what is written as 0.00 is neither good nor bad
 
 
-def compared(before: EvaluationResult, after: EvaluationResult) -> str:
-    """Describe in one sentence whether the second evaluation is better than the first."""
+def compared(before: EvaluationResult, after: EvaluationResult, comparison: Comparison | None = None) -> str:
+    """Describe in one sentence whether the second evaluation follows more trajectories than the first.
+
+    With `comparison`, the sentence also names the metrics that are better or worse.
+    """
     first, second = judge(before), judge(after)
     kept = [{each.outcome.trial.name: each.followed for each in one.trials} for one in (first, second)]
     shared = kept[0].keys() & kept[1].keys()
@@ -50,6 +53,10 @@ def compared(before: EvaluationResult, after: EvaluationResult) -> str:
     offsets = before.suite.get("offset_mean"), after.suite.get("offset_mean")
     if offsets[0] is not None and offsets[1] is not None:
         parts.append(f"it is {offsets[1]:.2f} m from its path on average, {offsets[0]:.2f} m before")
+    for verdict in ("better", "worse"):
+        changes = () if comparison is None else comparison.metrics
+        if names := [METRICS[one.metric].label for one in changes if one.verdict == verdict and one.metric in METRICS]:
+            parts.append(f"{verdict} metrics: {listed(names)}")
     return f"{start}: {'; '.join(parts)}."
 
 
@@ -63,7 +70,7 @@ def _direction(before: EvaluationResult, after: EvaluationResult) -> str:
     if len(change) < LEAST_REPLICATES:
         return "Unclear, because there are too few replicates"
     if not change.any() or probability(change) > 1.0 - CONFIDENCE:
-        return "No difference found"
+        return "No difference in followed trajectories found"
     return "Better" if change.mean() > 0.0 else "Worse"
 
 

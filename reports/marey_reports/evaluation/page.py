@@ -105,6 +105,6 @@ def render_comparison(
         Section("definitions", "Definitions", definitions(after.options.limits)),
         Section("provenance", "Provenance", provenance([before, after], labels)),
     ]
-    lead = element("p", compared(before, after), class_="verdict"), headline_of_two(before, after, labels)
+    lead = element("p", compared(before, after, comparison), class_="verdict"), headline_of_two(before, after, labels)
     head = ReportHead("Comparison of two evaluations", title, after.provenance.code_version, inputs)
     return page(head, lead, sections)

@@ -27,6 +27,7 @@ from tests.support.present import present
 from tests.support.report_pages import HOSTILE, Page, is_sound
 from tests.support.tiers import is_soak
 
+from marey_motion.evaluation.compare import MetricChange
 from marey_motion.evaluation.judgement import GRADES, judge, judge_trial, mean_speed_m_s
 from marey_motion.evaluation.result import EvaluationResult, ReplicateValues, TrialResult
 from marey_motion.evaluation.scenario import Trial, demand
@@ -381,10 +382,24 @@ def test_a_comparison_says_whether_it_helped(result: EvaluationResult) -> None:
     few, many = replicated(judged(result, 3, 10), 3, 2, 3, 4), replicated(judged(result, 5, 10), 5, 5, 5, 6)
     assert compared(few, many).startswith("Better: the character follows 5.2 of 10 trajectories, 3 before; it is ")
     assert compared(many, few).startswith("Worse: ")
-    assert compared(few, few).startswith("No difference found: the character follows 3 of 10 trajectories, as before")
+    none = "No difference in followed trajectories found: "
+    assert compared(few, few).startswith(f"{none}the character follows 3 of 10 trajectories, as before")
     chance = replicated(judged(result, 5, 10), 2, 5, 1, 6)
-    assert compared(few, chance).startswith("No difference found: ")
+    assert compared(few, chance).startswith(none)
     assert compared(result, result).startswith("Unclear, because there are no replicates: ")
+
+
+def test_a_comparison_names_the_metrics_that_are_better_or_worse(result: EvaluationResult) -> None:
+    """Also if as many trajectories are followed: nobody should read that there is no difference."""
+    few = replicated(judged(result, 3, 10), 3, 2, 3, 4)
+    changes = (
+        MetricChange("foot_skate", 0.7, 0.8, 0.1, 0.05, 0.15, 10, 4, 0.001),
+        MetricChange("abs_se_v", 0.7, 0.6, -0.1, -0.15, -0.05, 10, 4, 0.001),
+        MetricChange("dse_v", 0.7, 0.6, -0.1, -0.25, 0.05, 10, 4, 0.4),
+    )
+    comparison = replace(compare_results(result, result), metrics=changes)
+    sentence = compared(few, few, comparison)
+    assert sentence.endswith("; better metrics: speed error; worse metrics: feet slide.")
 
 
 def test_a_comparison_shows_what_came_went_and_changed(result: EvaluationResult) -> None:
