@@ -20,6 +20,7 @@ from marey_client.cli.terminal.failures import WrongUsage
 from marey_client.cli.terminal.invocation import connect, output_option, refuse_ignored
 from marey_client.cli.terminal.output import print_message
 from marey_schemas.kinds import Kind
+from marey_schemas.wording import counted
 
 if TYPE_CHECKING:
     from marey_client.items import ItemHandle
@@ -149,10 +150,8 @@ def _source_of(marey: Marey, clip: ItemHandle, revision: int | None) -> tuple[It
     sources = [one for one in graph.revisions if one.kind is Kind.CLIP and one.distance == -1 and not one.deleted]
     if len(sources) != 1:
         place = f"{clip.project}/{clip.path}"
-        raise WrongUsage(
-            f"{place} was made from {len(sources)} clips that exist; name a clip after --beside, see `marey lineage "
-            f"{place}`"
-        )
+        made = f"made from {counted(len(sources), 'clip')}" if sources else "not made from a clip that still exists"
+        raise WrongUsage(f"{place} was {made}; name a clip after --beside, see `marey lineage {place}`")
     found: ItemHandle = marey.project(clip.project).items(Kind.CLIP).get(sources[0].item)
     return found, sources[0].revision
 

@@ -76,7 +76,8 @@ def test_the_commands_of_the_page_give_addresses_whose_codes_open_the_project(
     for options, told in wrong.items():
         assert told in run("view", "lab/gaits/raw/walk", *options, status=2).stderr
     assert not list(run.folder.glob("x.*"))
-    assert "0 clips that exist" in run("view", "lab/gaits/raw/turn", "--beside", "source", status=2).stderr
+    without_source = run("view", "lab/gaits/raw/turn", "--beside", "source", status=2).stderr
+    assert "was not made from a clip that still exists; name a clip" in without_source
 
 
 def _write_pages(run: CommandLine) -> None:
