@@ -91,9 +91,9 @@ def run(trial: LoadTrial, say: Say) -> list[str]:
         lease = start_attempt(house.people, house.tokens, house.variables["item"])
         made.begin_work()
         record = Record()
-        visitors.warm_up(record)
         say(f"{trial.rate:g} requests per second for {trial.minutes:g} minutes")
         with _measuring(made, house, lease, record):
+            visitors.warm_up(record)
             visitors.visit(arrival_times(trial.rate, 60 * trial.minutes, trial.seed), record)
         unfinished = visitors.unfinished_jobs()
         growths = {name: _growth(samples) for name, samples in record.memory.items()}
