@@ -93,7 +93,7 @@ class PipelineError(ValueError):
     @classmethod
     def unknown_step(cls, pointer: str, name: str, pipeline: PipelineCreate) -> Self:
         """Return the error for a reference, at `pointer` in the request, to a step that does not exist."""
-        return cls(pointer, "unknown-step", f"There is no step {name!r}; there are {', '.join(pipeline.steps)}.")
+        return cls(pointer, "unknown-step", f"There is no step {name!r}; the steps are {', '.join(pipeline.steps)}.")
 
 
 def order_steps(pipeline: PipelineCreate) -> tuple[str, ...]:
