@@ -3,6 +3,7 @@
 from typing import Annotated, Any
 
 import pytest
+from hypothesis import given, strategies
 from pydantic import BaseModel, Field, ValidationError
 
 from marey_schemas.editing.commands import Resample, Trim
@@ -77,6 +78,30 @@ def test_of_the_types_of_a_value_only_the_likeliest_counts(given: Any, expected:
     for fault in told(JobCreate, {"kind": "retarget", "inputs": {"clips": given}}):
         found.setdefault(fault.pointer.removeprefix("/inputs/clips"), []).append(fault.detail)
     assert found == expected
+
+
+NAMES = strategies.sampled_from(("item", "collection", "dataset", "job", "revision", "ref", "recursive", "tags", "x"))
+ANYTHING = strategies.recursive(
+    strategies.none() | strategies.booleans() | strategies.integers(-2, 2) | strategies.sampled_from(("", "x", "a/b")),
+    lambda inner: strategies.lists(inner, max_size=3) | strategies.dictionaries(NAMES, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(inputs=ANYTHING)
+def test_whatever_is_refused_has_an_error_at_a_place_that_exists(inputs: Any) -> None:
+    tree = {"kind": "retarget", "inputs": {"clips": inputs}}
+    try:
+        JobCreate.model_validate(tree)
+    except ValidationError as error:
+        found = field_errors(error, JobCreate, tree)
+        assert found
+        for fault in found:
+            place: Any = tree
+            *steps, last = fault.pointer.split("/")[1:]
+            for step in steps:
+                place = place[int(step)] if isinstance(place, list) else place[step]
+            assert isinstance(place, dict) or int(last) < len(place)
 
 
 class Lengths(BaseModel):
