@@ -41,13 +41,15 @@ def main() -> int:
         f"{platform.python_implementation()} {platform.python_version()}, {platform.machine()}, {platform.system()}"
     )
     rows: list[Row] = []
-    for name in arguments.names or names:
-        console.print(f"running {name} …")
-        rows += importlib.import_module(f"benchmarks.bench_{name}").run()
-    console.print(_table(rows))
-    if arguments.json:
-        with open(arguments.json, "w", encoding="utf-8") as file:
-            json.dump([asdict(row) for row in rows], file, indent=2)
+    try:
+        for name in arguments.names or names:
+            console.print(f"running {name} …")
+            rows += importlib.import_module(f"benchmarks.bench_{name}").run()
+    finally:  # a benchmark that fails must not take the results of the others with it
+        console.print(_table(rows))
+        if arguments.json:
+            with open(arguments.json, "w", encoding="utf-8") as file:
+                json.dump([asdict(row) for row in rows], file, indent=2)
     return int(arguments.strict and any(row.met is False for row in rows))
 
 
