@@ -35,6 +35,7 @@ from marey_server.store.database.connections import Database
 pytestmark = pytest.mark.timeout(900)
 
 HOSTILE_NAME = "</script><img src=x onerror='window.harmed = true'><!--<script>"
+LONG_NAME = "path with corners of 90 degrees to the left of the facing direction at 2 m/s, in a take with a long name"
 OWN_PAGE = {"Sec-Fetch-Site": "same-origin"}
 
 
@@ -228,8 +229,9 @@ def test_a_page_from_disk_plays_its_motions_without_a_request(
     with Marey(server.address, token) as marey:
         clips = [marey.project("lab").clips[name] for name in names]
         motions = motions_of_clips([(clip, None) for clip in clips], None)
+        long = replace(motions[0], name=LONG_NAME)
         hostile = [replace(motions[0], name=HOSTILE_NAME), motions[1]]
-        for name, group in (("alone", motions[:1]), ("pair", hostile), ("five", [*motions, *motions, motions[0]])):
+        for name, group in (("alone", motions[:1]), ("pair", hostile), ("five", [*motions, *motions, long])):
             save_page(marey.transport, tmp_path / f"{name}.html", group)
         (tmp_path / "empty.html").write_bytes(read_template(marey.transport))
     given = {

@@ -102,6 +102,9 @@ it("fits a narrow window, also with five motions", async () => {
     const page = await opened(name, { width: 390 });
     await scene(page, (one) => one.actors.length === count);
     expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBeLessThanOrEqual(390);
+    const heights = await page.locator(".label span").evaluateAll((labels) => labels.map((label) => label.clientHeight));
+    expect(heights.length).toBe(count);
+    expect(Math.max(...heights), "names of more than two lines would lie over heads").toBeLessThanOrEqual(36);
     await picture(page, `player-${name}-390`);
     await page.setViewportSize({ width: 1280, height: 800 });
     await picture(page, `player-${name}-1280`);

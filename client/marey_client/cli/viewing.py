@@ -197,9 +197,11 @@ class Drawing:
 
         if found.item.kind is Kind.MODEL:
             motions = motions_of_samples(found, revision, self.rows, self.seed)
+            about = f"samples of {found.path}, seed {self.seed}"
         else:
             motions = motions_of_worst_trials(found, revision, self.rows)
-        save_page(found.transport, self.out, motions)
+            about = f"worst trials of {found.path}"
+        save_page(found.transport, self.out, motions, about)
         return self.out
 
     def _play_clips(self, pair: Sequence[tuple[Any, int | None]], frames: slice | None) -> Path:

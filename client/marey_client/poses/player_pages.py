@@ -70,12 +70,16 @@ def page_with(template: bytes, title: str, motions: Sequence[ShownMotion]) -> by
     return template.replace(_PLACE, _PLACE.replace(b"></", b">" + data.encode() + b"</"))
 
 
-def save_page(transport: Transport, target: Path, motions: Sequence[ShownMotion]) -> None:
-    """Write a page that plays motions beside each other to a file; if writing fails, `target` stays as it was."""
+def save_page(transport: Transport, target: Path, motions: Sequence[ShownMotion], about: str = "") -> None:
+    """Write a page that plays motions beside each other to a file; if writing fails, `target` stays as it was.
+
+    The title of the page is `about`, which says what the motions are; without it, the names of the motions.
+    """
     if not 1 <= len(motions) <= MOST_MOTIONS:
         raise BadArgument(f"a page plays 1 to {MOST_MOTIONS} motions, not {len(motions)}")
-    title = " beside ".join(one.name for one in motions[:2]) + (" …" if len(motions) > 2 else "")
-    page = page_with(read_template(transport), f"{title} – Marey", motions)
+    names = " beside ".join(one.name for one in motions)
+    title = names if not about else f"{about}: {names}" if len(motions) == 1 else about
+    page = page_with(read_template(transport), title, motions)
     with saved_atomically(target) as file:
         file.write(page)
 
@@ -109,10 +113,7 @@ def _read_clip(one: ClipOfStrip, frames: slice | None, *, with_revision: bool) -
 def motions_of_samples(model: ModelHandle, revision: int | None, n: int, seed: int) -> list[ShownMotion]:
     """Draw `n` samples of a model, and return them as motions for a page."""
     drawn = model.sample(n, seed, revision=revision)
-    return [
-        shown_motion(model, f"sample {number} of {model.path}, seed {seed}", motion)
-        for number, motion in enumerate(drawn.motions, 1)
-    ]
+    return [shown_motion(model, f"sample {number}", motion) for number, motion in enumerate(drawn.motions, 1)]
 
 
 def shown_motion(item: ItemHandle, name: str, motion: MotionDocument) -> ShownMotion:

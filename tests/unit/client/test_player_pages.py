@@ -107,12 +107,25 @@ def test_a_page_is_written_whole_or_not_at_all(script: ScriptedServer, tmp_path:
     with script.marey() as marey:
         save_page(marey.transport, target, [a_shown("a"), a_shown("b")])
         written = target.read_bytes()
-        assert json.loads(data_of(written))["title"] == "a beside b – Marey"
+        assert json.loads(data_of(written))["title"] == "a beside b"
         with pytest.raises(MareyError, match="no element for motion, because client and server"):
             save_page(marey.transport, target, [a_shown("c")])
     assert target.read_bytes() == written
     assert list(tmp_path.iterdir()) == [target]
     assert {request.url.path for request in script.requests} == {"/api/v1/pages/player"}
+
+
+@pytest.mark.parametrize(
+    ("names", "title"),
+    [(["sample 1"], "samples of walk: sample 1"), (["sample 1", "sample 2"], "samples of walk")],
+)
+def test_the_title_of_a_page_says_what_the_motions_are(
+    script: ScriptedServer, tmp_path: Path, names: list[str], title: str
+) -> None:
+    script.answers.append(httpx.Response(200, content=TEMPLATE))
+    with script.marey() as marey:
+        save_page(marey.transport, tmp_path / "samples.html", [a_shown(name) for name in names], "samples of walk")
+    assert json.loads(data_of((tmp_path / "samples.html").read_bytes()))["title"] == title
 
 
 def test_a_server_without_pages_is_named_with_what_to_do(script: ScriptedServer, tmp_path: Path) -> None:
