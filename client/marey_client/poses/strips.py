@@ -165,6 +165,7 @@ def draw_worst_trials(
     ranked = ranked_trials(evaluation, document)
     strips = import_optional("marey_reports.drawing.strips", FIGURES_EXTRA)
     records = evaluation.records(revision=revision)
+    demands = demands_of_trials(document)
     shown = DisplayedFrames(evaluation, document)
     rows, times = [], []
     for one in ranked[:count]:
@@ -175,7 +176,7 @@ def draw_worst_trials(
         poses = [shown.pose(int(record["rows"][tick])) for tick in ticks]
         limits = f"{counted(len(one['beyond_limits']), 'measure')} beyond limits"
         headings = np.asarray(record["headings"][ticks], dtype=np.float64)
-        rows.append(strips.PoseRow(name, limits, poses, headings_rad=headings))
+        rows.append(strips.PoseRow(demands[name], limits, poses, headings_rad=headings))
     about = f"{part_of(len(rows), len(ranked), 'trial')}, the worst first"
     labels = [f"{time_s:.1f} s" for time_s in times]
     figure = strips.draw_pose_rows(rows, ["after"] * len(times), labels, about=about)
@@ -188,6 +189,14 @@ def ranked_trials(evaluation: EvaluationHandle, document: dict[str, Any]) -> lis
     if not any("worst_rank" in one for one in ranked):
         raise BadArgument(f"{evaluation.path!r} does not say which trials are the worst; evaluate the clips again")
     return ranked
+
+
+def demands_of_trials(document: dict[str, Any]) -> dict[str, str]:
+    """Return what each trial of an evaluation demands, as a phrase for people, by the name of the trial."""
+    documents = import_optional("marey_motion.evaluation.result_documents", FIGURES_EXTRA)
+    demand = import_optional("marey_motion.evaluation.scenario", FIGURES_EXTRA).demand
+    trials = [documents.trial_from_document(one["trial"]) for one in document["trials"]]
+    return {trial.name: demand(trial) for trial in trials}
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from marey_client.handles.clips import ClipHandle
 from marey_client.handles.evaluations import EvaluationHandle
 from marey_client.poses.pictures import FIGURES_EXTRA
 from marey_client.poses.player_pages import ShownMotion, shown_motion
-from marey_client.poses.strips import ClipOfStrip, DisplayedFrames, mirrored, ranked_trials
+from marey_client.poses.strips import ClipOfStrip, DisplayedFrames, demands_of_trials, mirrored, ranked_trials
 from marey_schemas.documents.clips import MotionDocument
 from marey_schemas.documents.references import RevisionRef
 
@@ -31,8 +31,9 @@ def motions_of_worst_trials(evaluation: EvaluationHandle, revision: int | None, 
     ranked = ranked_trials(evaluation, document)
     records = evaluation.records(revision=revision)
     recorded = _RecordedClips(DisplayedFrames(evaluation, document))
+    demands = demands_of_trials(document)
     names = [one["trial"] for one in ranked[:count]]
-    return [recorded.motion(name, records[name]) for name in names]
+    return [recorded.motion(demands[name], records[name]) for name in names]
 
 
 class _RecordedClips:
@@ -43,7 +44,7 @@ class _RecordedClips:
         self._clips: dict[tuple[str, int, bool], Any] = {}
 
     def motion(self, name: str, record: dict[str, NDArray[Any]]) -> ShownMotion:
-        """Return the motion of the trial `name`, assembled from the trial's record of ticks."""
+        """Return the motion of a trial, assembled from the trial's record of ticks, under a name for people."""
         places = [self._shown.place(int(row)) for row in record["rows"]]
         clips = [self._whole(one.clip, one.revision, is_mirrored=one.mirrored) for one in places]
         poses = np.stack([clip.poses[one.frame] for clip, one in zip(clips, places, strict=True)]).astype(np.float64)

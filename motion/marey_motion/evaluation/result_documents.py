@@ -156,7 +156,9 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
         options=options_from_tree(tree["options"]),
         provenance=Provenance(**tree["provenance"]),
         clips=clips,
-        trials=tuple(TrialResult(_trial(one["trial"]), one["metrics"], one["regimes"]) for one in tree["trials"]),
+        trials=tuple(
+            TrialResult(trial_from_document(one["trial"]), one["metrics"], one["regimes"]) for one in tree["trials"]
+        ),
         suite=tree["suite"],
         usage=_usage(tree["usage"], clips),
         switches=tree["switches"],
@@ -169,7 +171,8 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
     )
 
 
-def _trial(tree: Mapping[str, Any]) -> Trial:
+def trial_from_document(tree: Mapping[str, Any]) -> Trial:
+    """Return the trial that a part of an evaluation's document describes."""
     path = tuple((x, z, heading) for x, z, heading in tree.get("path", ()))
     return Trial(**(dict(tree) | {"path": path}))
 
