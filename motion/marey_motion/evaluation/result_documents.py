@@ -172,7 +172,16 @@ def _result(tree: Mapping[str, Any], records: Sequence[TrialRecord]) -> Evaluati
 
 
 def trial_from_document(tree: Mapping[str, Any]) -> Trial:
-    """Return the trial that a part of an evaluation's document describes."""
+    """Return the trial that a part of an evaluation's document describes.
+
+    Parameters
+    ----------
+    tree : mapping    member `trial` of an entry in `trials` of the document
+
+    Returns
+    -------
+    Trial    the trial
+    """
     path = tuple((x, z, heading) for x, z, heading in tree.get("path", ()))
     return Trial(**(dict(tree) | {"path": path}))
 
