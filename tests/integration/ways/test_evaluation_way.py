@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,8 +14,9 @@ import pytest
 from tests.support.command_line import CommandLine
 
 from marey_client.errors import JobUnsuccessful
-from marey_client.handles.evaluations import name_of_trial
+from marey_client.handles.evaluations import name_of_trial, worst_rows_first
 from marey_client.imports import find_files
+from marey_client.poses.player_pages import ShownMotion
 from marey_client.poses.trials import motions_of_worst_trials
 from marey_client.project import ProjectHandle
 from marey_motion import forward_directions, forward_kinematics
@@ -23,7 +25,7 @@ from marey_motion.documents import skeleton_from_document
 from marey_motion.evaluation.result_documents import trial_from_document
 from marey_motion.evaluation.scenario import demand
 from marey_motion.formats import write_bvh
-from marey_motion.gait import game_skeleton
+from marey_motion.gait import game_skeleton, generate_gait
 from marey_reports.drawing.stick_figures import body_of
 from marey_schemas.documents.skeletons import SkeletonHierarchy
 from marey_schemas.items import ItemChange
@@ -81,15 +83,7 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     played = motions_of_worst_trials(found, None, 2)
     assert [one.name for one in played] == demands[:2]
     for one, trial in zip(played, worst, strict=False):
-        record = found.records()[trial]
-        skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(one.hierarchy))
-        facing, pelvis = body_of(skeleton).facing, body_of(skeleton).pelvis
-        points = forward_kinematics(skeleton, one.motion.poses)
-        assert points[:, pelvis, ::2] == pytest.approx(record["positions"], abs=1e-4)
-        ahead = forward_directions(points, *facing)
-        turned = np.stack((np.sin(record["headings"]), np.cos(record["headings"])), axis=1)
-        assert ahead == pytest.approx(turned, abs=1e-3)
-        assert one.motion.frame_rate_hz * len(one.motion.poses) >= 30
+        _assert_follows(one, found.records()[trial])
     assert (
         "no effect on a model or an evaluation"
         in run("view", "lab/walks-eval", "--out", "x.svg", "--beside", "source", status=2).stderr
@@ -104,6 +98,35 @@ def test_from_a_folder_of_clips_to_a_verdict_and_a_report(lab: ProjectHandle, ru
     assert json.loads((tmp_path / "one.json").read_bytes()) == found.walk_graph(trial=trial)
     with pytest.raises(ValueError, match=r"\.json or \.graphml"):
         found.save_walk_graph(tmp_path / "walks.dot")
+
+
+def _assert_follows(shown: ShownMotion, record: dict[str, Any]) -> None:
+    """Assert that the pelvis of a shown trial has the recorded positions, and its body the recorded headings."""
+    skeleton = skeleton_from_document(SkeletonHierarchy.model_validate(shown.hierarchy))
+    facing, pelvis = body_of(skeleton).facing, body_of(skeleton).pelvis
+    moved = tuple(skeleton.index_of(name) for name in shown.motion.translated_joints)
+    points = forward_kinematics(
+        skeleton, shown.motion.poses, translations=shown.motion.translations, translated_joints=moved
+    )
+    assert points[:, pelvis, ::2] == pytest.approx(record["positions"], abs=1e-4)
+    ahead = forward_directions(points, *facing)
+    turned = np.stack((np.sin(record["headings"]), np.cos(record["headings"])), axis=1)
+    assert ahead == pytest.approx(turned, abs=1e-3)
+    assert shown.motion.frame_rate_hz * len(shown.motion.poses) >= 30
+
+
+def test_worst_trials_are_shown_with_the_translations_of_their_joints(lab: ProjectHandle, tmp_path: Path) -> None:
+    gait = generate_gait(speed_m_s=1.9, turn_rate_rad_s=0.0, duration_s=6.0)
+    sway = gait.skeleton.offsets[1] + np.sin(np.arange(gait.frame_count) / 5.0)[:, None] * (0.0, 0.02, 0.0)
+    swaying = replace(gait, translations=sway[:, None].astype(np.float32), translated_joints=(1,))
+    (tmp_path / "swaying.bvh").write_bytes(write_bvh(swaying))
+    lab.imports.upload(find_files([tmp_path / "swaying.bvh"]).files, ImportOptions(collection="walks"))
+    found = lab.evaluation(lab.evaluate("walks", **SMALL))
+    played = motions_of_worst_trials(found, None, 12)
+    for one, trial in zip(played, worst_rows_first(found.trials()), strict=True):
+        _assert_follows(one, found.records()[trial["trial"]])
+    sways = [np.ptp(one.motion.translations[:, 0, 1]) for one in played if one.motion.translations is not None]
+    assert max(sways) == pytest.approx(0.04, abs=0.005)
 
 
 def test_an_evaluation_holds_every_tick_and_knows_every_clip(lab: ProjectHandle) -> None:
