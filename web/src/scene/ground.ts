@@ -14,12 +14,14 @@ export class Ground {
   constructor() {
     this.plane.rotation.x = -Math.PI / 2;
     this.plane.position.y = -0.006;
-    // Legs of a take whose origin is at the hips are below the ground, and must be seen there.
-    this.plane.renderOrder = -1;
-    this.plane.material.depthWrite = false;
     this.fineLines.position.y = -0.004;
     this.lines.position.y = -0.002;
-    this.group.add(this.plane, this.fineLines, this.lines);
+    // Legs of a take whose origin is at the hips are below the ground, and must be seen there: the ground is drawn first.
+    for (const [order, part] of [this.plane, this.fineLines, this.lines].entries()) {
+      part.renderOrder = order - 3;
+      part.material.depthWrite = false;
+      this.group.add(part);
+    }
   }
 
   paint(palette: Palette): void {
