@@ -33,7 +33,7 @@ class ProjectCollections(Resource):
     """All folders."""
 
     path = "/projects/{project}/collections"
-    tag = "ProjectCollections"
+    tag = "Collections"
 
     @reads(access=Access.READER, query=CollectionsQuery, answer=Collection, paged=True)
     async def get(self, project: str, query: CollectionsQuery) -> Rendered:
@@ -72,7 +72,7 @@ class CollectionResource(Resource):
     """A folder."""
 
     path = "/projects/{project}/collections/{collection}"
-    tag = "ProjectCollections"
+    tag = "Collections"
 
     @reads(access=Access.READER, answer=Collection, etag=True)
     async def get(self, project: str, collection: str) -> Rendered:
@@ -103,7 +103,7 @@ class CollectionRestoration(Resource):
     """Restoration of a deleted folder."""
 
     path = "/projects/{project}/collections/{collection}/restore"
-    tag = "ProjectCollections"
+    tag = "Collections"
 
     @writes(access=Access.MAINTAINER, answer=Collection, etag=True, idempotency="key", in_folders=True)
     async def post(self, project: str, collection: str) -> Rendered:

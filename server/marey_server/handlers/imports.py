@@ -53,7 +53,7 @@ class ProjectImports(Resource):
     """Import of motion files into a project."""
 
     path = "/projects/{project}/imports"
-    tag = "ProjectImports"
+    tag = "Imports"
 
     async def begin(self, **_path: str) -> None:
         """Check the media type of the body before the files are received."""

@@ -96,7 +96,7 @@ class ItemsOfKind(IndexSearcher):
     """Items of a kind in a project."""
 
     path = "/projects/{project}/{kind}"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @reads(access=Access.READER, query=ItemsQuery, answer=Item, paged=True, attempts=True)
     async def get(self, project: str, kind: str, query: ItemsQuery) -> Rendered:
@@ -159,7 +159,7 @@ class ItemResource(Resource):
     """An item."""
 
     path = "/projects/{project}/{kind}/{item}"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @reads(access=Access.READER, answer=Item, etag=True, attempts=True)
     async def get(self, project: str, kind: str, item: str) -> Rendered:
@@ -185,7 +185,7 @@ class ItemRestoration(Resource):
     """Restoration of a deleted item."""
 
     path = "/projects/{project}/{kind}/{item}/restore"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @writes(access=Access.MAINTAINER, answer=Item, etag=True, idempotency="key", in_folders=True)
     async def post(self, project: str, kind: str, item: str) -> Rendered:
@@ -197,7 +197,7 @@ class ItemReversion(Resource):
     """Reversion of an item to an earlier revision."""
 
     path = "/projects/{project}/{kind}/{item}/revert"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @writes(
         access=Access.CONTRIBUTOR,
@@ -218,7 +218,7 @@ class Revisions(Resource):
     """The history of an item."""
 
     path = "/projects/{project}/{kind}/{item}/revisions"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @reads(access=Access.READER, query=PageQuery, answer=Revision, paged=True)
     async def get(self, project: str, kind: str, item: str, query: PageQuery) -> Rendered:
@@ -232,7 +232,7 @@ class RevisionResource(Resource):
     """A revision."""
 
     path = "/projects/{project}/{kind}/{item}/revisions/{revision:int}"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @reads(access=Access.READER, answer=Revision)
     async def get(self, project: str, kind: str, item: str, revision: int) -> Rendered:
@@ -252,7 +252,7 @@ class LineageResource(Resource):
     """Lineage of a revision."""
 
     path = "/projects/{project}/{kind}/{item}/lineage"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @reads(access=Access.READER, query=LineageQuery, answer=Lineage)
     async def get(self, project: str, kind: str, item: str, query: LineageQuery) -> Rendered:
@@ -264,7 +264,7 @@ class LineageGraphResource(Resource):
     """Lineage of a revision through any number of jobs."""
 
     path = "/projects/{project}/{kind}/{item}/lineage-graph"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @reads(access=Access.READER, query=LineageRequest, answer=LineageGraph)
     async def get(self, project: str, kind: str, item: str, query: LineageRequest) -> Rendered:
@@ -276,7 +276,7 @@ class StalenessResource(Resource):
     """Staleness of an item."""
 
     path = "/projects/{project}/{kind}/{item}/stale"
-    tag = "ItemsOfKind"
+    tag = "Items"
 
     @reads(access=Access.READER, answer=Staleness)
     async def get(self, project: str, kind: str, item: str) -> Rendered:

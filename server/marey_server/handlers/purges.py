@@ -34,7 +34,7 @@ class DatasetPurges(Resource):
     """Purges of deleted datasets."""
 
     path = "/projects/{project}/dataset-purges"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(access=Access.OWNER, body=DatasetPurgeRequest, answer=DatasetPurgeAnswer, idempotency="key")
     async def post(self, project: str, body: DatasetPurgeRequest) -> Rendered:

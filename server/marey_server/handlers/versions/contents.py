@@ -25,7 +25,7 @@ class ProjectContents(Resource):
     """Revisions and documents in a form that is the same on every server."""
 
     path = "/projects/{project}/contents"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, body=ContentsRequest, answer=Document, compressed=True)
     async def post(self, project: str, body: ContentsRequest) -> Rendered:
@@ -48,7 +48,7 @@ class ExportChecks(Resource):
     """Checks before revisions of a dataset are exported."""
 
     path = "/projects/{project}/datasets/{dataset}/export-checks"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, body=ExportCheck, answer=ExportPermission)
     async def post(self, project: str, dataset: str, body: ExportCheck) -> Reply:
@@ -67,7 +67,7 @@ class ReceivedContents(Resource):
     """Revisions from archives and other servers."""
 
     path = "/projects/{project}/datasets/{dataset}/contents"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(
         access=Access.MAINTAINER,
@@ -93,7 +93,7 @@ class ReceivedCommits(Resource):
     """Commits from archives and other servers."""
 
     path = "/projects/{project}/datasets/{dataset}/received-commits"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(
         access=Access.MAINTAINER,

@@ -27,7 +27,7 @@ class ProjectDatasets(Resource):
     """Datasets of a project."""
 
     path = "/projects/{project}/datasets"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, query=PageQuery, answer=Dataset, paged=True)
     async def get(self, project: str, query: PageQuery) -> Rendered:
@@ -49,7 +49,7 @@ class DatasetResource(Resource):
     """A dataset."""
 
     path = "/projects/{project}/datasets/{dataset}"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, answer=Dataset, etag=True)
     async def get(self, project: str, dataset: str) -> Rendered:
@@ -67,7 +67,7 @@ class DatasetRefs(Resource):
     """Branches and tags of a dataset."""
 
     path = "/projects/{project}/datasets/{dataset}/refs"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, query=PageQuery, answer=Ref, paged=True)
     async def get(self, project: str, dataset: str, query: PageQuery) -> Rendered:
@@ -84,7 +84,7 @@ class DatasetRef(Resource):
     """A branch or a tag."""
 
     path = "/projects/{project}/datasets/{dataset}/refs/{ref}"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, answer=Ref, etag=True)
     async def get(self, project: str, dataset: str, ref: str) -> Rendered:
@@ -113,7 +113,7 @@ class BranchProtection(Resource):
     """Protection rule of a branch."""
 
     path = "/projects/{project}/datasets/{dataset}/refs/{ref}/protection"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(access=Access.MAINTAINER, body=ProtectionRule, answer=Ref, etag=True, precondition="required")
     async def put(self, project: str, dataset: str, ref: str, body: ProtectionRule) -> Rendered:
@@ -143,7 +143,7 @@ class DatasetCommits(Resource):
     """Commits of a dataset."""
 
     path = "/projects/{project}/datasets/{dataset}/commits"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, query=CommitsQuery, answer=ListedCommit, paged=True)
     async def get(self, project: str, dataset: str, query: CommitsQuery) -> Rendered:
@@ -175,7 +175,7 @@ class DatasetMerges(Resource):
     """Merges of versions into branches."""
 
     path = "/projects/{project}/datasets/{dataset}/merges"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(
         access=Access.CONTRIBUTOR,
@@ -198,7 +198,7 @@ class CherryPicks(Resource):
     """Cherry-picks: the changes of single commits, repeated on branches."""
 
     path = "/projects/{project}/datasets/{dataset}/cherry-picks"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(
         access=Access.CONTRIBUTOR,
@@ -220,7 +220,7 @@ class DatasetReverts(Resource):
     """Reverts: the changes of single commits, undone on branches."""
 
     path = "/projects/{project}/datasets/{dataset}/reverts"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(
         access=Access.CONTRIBUTOR,
@@ -242,7 +242,7 @@ class FolderCheckout(Resource):
     """Checkout of a version into the folder of a dataset."""
 
     path = "/projects/{project}/datasets/{dataset}/checkout"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @writes(access=Access.MAINTAINER, body=CheckoutRequest, answer=CheckoutAnswer)
     async def post(self, project: str, dataset: str, body: CheckoutRequest) -> Rendered:
@@ -262,7 +262,7 @@ class DatasetCommit(Resource):
     """A commit."""
 
     path = "/projects/{project}/datasets/{dataset}/commits/{version}"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, answer=Commit)
     async def get(self, project: str, dataset: str, version: str) -> Rendered:
@@ -281,7 +281,7 @@ class DatasetEntries(Resource):
     """Entries of a version."""
 
     path = "/projects/{project}/datasets/{dataset}/entries"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, query=EntriesQuery, answer=Entry, paged=True, compressed=True)
     async def get(self, project: str, dataset: str, query: EntriesQuery) -> Rendered:
@@ -309,7 +309,7 @@ class EntryBlame(Resource):
     """Origins of the content of an entry."""
 
     path = "/projects/{project}/datasets/{dataset}/blame"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, query=BlameQuery, answer=EntryOrigins)
     async def get(self, project: str, dataset: str, query: BlameQuery) -> Rendered:
@@ -335,7 +335,7 @@ class VersionDifference(Resource):
     """Difference of two versions."""
 
     path = "/projects/{project}/datasets/{dataset}/difference"
-    tag = "ProjectDatasets"
+    tag = "Datasets"
 
     @reads(access=Access.READER, query=DifferenceQuery, answer=DatasetDifference, compressed=True)
     async def get(self, project: str, dataset: str, query: DifferenceQuery) -> Rendered:
