@@ -33,6 +33,9 @@ MEMORY = Path("/dev/shm")
 ENOUGH_BYTES = 4 << 30
 """Free space that is enough: databases of two test processes and the largest files of tests need less than half."""
 
+SETTINGS_OF_TESTS = ("MAREY_TEST_", "MAREY_WEB_")
+SETTINGS_OF_COLOURS = ("FORCE_COLOR", "NO_COLOR")
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Discard all compiled kernels if one of them has changed, before tests are distributed to processes."""
@@ -41,6 +44,7 @@ def pytest_configure(config: pytest.Config) -> None:
         keep_files_in_memory()
         name_runtime_folder()
         trust_no_authority()
+        forget_the_shell()
     be_patient()
     keep_folders_together(config)
     keep_bytecode()
@@ -51,6 +55,14 @@ def pytest_collection() -> Generator[None, object, object]:
     """Collect the tests, whose objects live until the end, without the garbage collector."""
     with loading_modules():
         return (yield)
+
+
+def forget_the_shell() -> None:
+    """Unset settings of Marey and of colours: a test must not depend on the shell that starts it."""
+    for name in tuple(os.environ):
+        is_setting = name.startswith("MAREY_") and not name.startswith(SETTINGS_OF_TESTS)
+        if is_setting or name in SETTINGS_OF_COLOURS:
+            del os.environ[name]
 
 
 def keep_folders_together(config: pytest.Config) -> None:
