@@ -387,7 +387,7 @@ def _copy_database(source: Path, target: Path) -> None:
             (state,) = writing.execute("PRAGMA quick_check").fetchone()
     except sqlite3.DatabaseError as error:
         target.unlink()
-        raise CommandFailed(f"{source} cannot be read as an SQLite database: {error}") from None
+        raise CommandFailed(f"cannot copy {source} as an SQLite database to {target}: {error}") from None
     if state != "ok":
         target.unlink()
         raise CommandFailed(f"the database {source} is damaged: {state}")

@@ -41,7 +41,8 @@ class Address:
             raise WrongUsage(f"{text!r} contains no project; write project/folder/name")
         if project in (".", "..") or "\\" in project:
             place = "/".join(one for one in text.replace("\\", "/").split("/") if one not in ("", ".", ".."))
-            raise WrongUsage(f"{text!r} is not the address of a folder or an item; did you mean {place!r}?")
+            remedy = f"did you mean {place!r}?" if place else "write project/folder/name"
+            raise WrongUsage(f"{text!r} is not the address of a folder or an item; {remedy}")
         return cls(project, path, path != "" and text.endswith("/"))
 
     @classmethod

@@ -229,10 +229,11 @@ def _checked_limit(among: VersionRange, evaluations: VersionEvaluations, limit: 
             raise CannotBisect(f"{values}, so no value is half-way between them; give a limit")
         limit = Limit((good + bad) / 2, above=bad > good)
     if limit.exceeded_by(good):
-        raise CannotBisect(
-            f"{values}; values {limit} are bad, so both versions are bad; give another limit, or an earlier good "
-            "version"
-        )
+        if limit.exceeded_by(bad):
+            end = "both versions are bad; give another limit, or an earlier good version"
+        else:
+            end = "the good version is bad and the bad one is good; exchange the versions, or give another limit"
+        raise CannotBisect(f"{values}; values {limit} are bad, so {end}")
     if not limit.exceeded_by(bad):
         raise CannotBisect(
             f"{values}; values {limit} are bad, so both versions are good; give another limit, or a later bad version"

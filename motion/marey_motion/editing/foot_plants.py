@@ -123,7 +123,7 @@ def plant_feet(
     lifts: Sequence[Floats] | None = None,
     options: PlantOptions | None = None,
 ) -> PlantedMotion:
-    """Fix planted feet to the ground.
+    """Fix planted feet to the ground: bend the legs, and lower the root where the legs do not reach.
 
     Parameters
     ----------

@@ -203,10 +203,16 @@ def reference(trial: Trial, rate_hz: float = TICK_RATE_HZ, look_ahead_s: float =
 
     Raises
     ------
-    MotionError    if the trial has no ticks, or if the time between its changes of speed or direction is not positive
+    MotionError    if a duration is negative, if the trial has no ticks, or if the time between changes is not positive
     """
     tick_count = round((trial.approach_s + trial.duration_s) * rate_hz)
-    if tick_count < 1 or trial.approach_s < 0.0 or trial.duration_s < 0.0:
+    if trial.approach_s < 0.0 or trial.duration_s < 0.0:
+        raise MotionError(
+            f"the approach takes {trial.approach_s:g} s and the rest of the trial {trial.duration_s:g} s; "
+            "neither may be negative",
+            where=trial.name,
+        )
+    if tick_count < 1:
         raise MotionError(
             f"a trial with an approach of {trial.approach_s:g} s and a duration of {trial.duration_s:g} s is "
             f"too short: it has no ticks at {rate_hz:g} Hz; make the approach or the duration longer",

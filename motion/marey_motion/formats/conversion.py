@@ -195,7 +195,7 @@ def _turned(rotations: NDArray[Real], axes: NDArray[np.float64]) -> NDArray[Real
 
 
 def _notices(source: SourceMotion, up_axis: UpAxis) -> list[CheckWarning]:
-    """List the changes that the reader and the conversion made to the data, as warnings for the user."""
+    """List warnings: changes that reader and conversion made to the data, and unusual properties of the file."""
     notices = []
     if up_axis != "y":
         message = f"the file has {up_axis} up; it was turned to y up"

@@ -80,7 +80,11 @@ def choose_up_axis(
 
 
 def _infer_up_axis(body: BodyMeasures, sibling_axis: UpAxis | None) -> UpAxis:
-    """Infer the upward axis from motion, rest pose and ground; `sibling_axis` is used if the motion is not clear."""
+    """Infer the upward axis from motion, rest pose and ground, and add the evidence to `body`.
+
+    `sibling_axis`, the axis of other files with this skeleton, is used unless the motion clearly stands along y, or the
+    body is on all fours and not a person.
+    """
     standing, resting = _body_axis(body.positions, body.landmarks), _body_axis(body.rest[:, None], body.landmarks)
     flat = _flat_axis(body)
     is_person = body.landmarks.by_names and resting[1] >= _CLEAR_COSINE

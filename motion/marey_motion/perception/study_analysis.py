@@ -133,7 +133,8 @@ def measure_pairs(clips: Sequence[MeasuredClip], progress: Progress) -> list[Pai
 
     Returns
     -------
-    list of PairDifferences    for each measurement, with the pairs in the order of `numpy.triu_indices`
+    list of PairDifferences    one for each kind of difference that the metric measures, with the pairs in the order of
+        `numpy.triu_indices`
 
     Raises
     ------

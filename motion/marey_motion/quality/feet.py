@@ -158,7 +158,7 @@ def skate_by_contact(feet: Feet) -> float | None:
 
 
 def skate_ratio(feet: Feet, options: QualityOptions) -> float | None:
-    """Compute the skate ratio: of the steps in which a toe is near the floor, the share in which this toe skates.
+    """Compute the skate ratio: how often a toe near the floor moves faster than allowed.
 
     Parameters
     ----------
@@ -167,12 +167,12 @@ def skate_ratio(feet: Feet, options: QualityOptions) -> float | None:
 
     Returns
     -------
-    float or None    0 to 1; None if no toe is near the floor in two successive frames
+    float or None    share of such pairs of frames, 0 to 1; None if no toe is near the floor in two successive frames
 
     Notes
     -----
-    As `FootSkateRatio` of the Kimodo benchmark (NVIDIA, 2026): a toe must be near the floor at both ends of the step.
-    Karunratanakul et al. (2023), Guided motion diffusion, divide by all steps instead.
+    As `FootSkateRatio` of the Kimodo benchmark (NVIDIA, 2026): a toe must be near the floor in both frames.
+    Karunratanakul et al. (2023), Guided motion diffusion, divide by all pairs of frames instead.
     """
     near = near_floor(feet, options)
     both = near[:-1] & near[1:]

@@ -249,8 +249,11 @@ class DistancesParams(DistanceOptions, MetricChoice):
 
 
 def count_distance_tasks(_params: DistancesParams, clips: int) -> int:
-    """Return the number of tasks of a comparison: one for each pair of blocks of clips, and for each block alone."""
-    if clips > MOST_COMPARED_CLIPS:  # a single task refuses the job
+    """Return the number of tasks of a comparison: one for each pair of blocks of clips, and for each block alone.
+
+    For more than `MOST_COMPARED_CLIPS` clips it is 1, a task that refuses the job.
+    """
+    if clips > MOST_COMPARED_CLIPS:
         return 1
     blocks = max(1, -(-clips // CLIPS_PER_BLOCK))
     return blocks * (blocks + 1) // 2

@@ -122,7 +122,10 @@ class KindDeclaration:
             raise ValueError(f"job kind {self.name}: declare fan_out or task_count, not both")
 
     def count_tasks(self, params: Any, inputs: Mapping[str, Sequence[Any]]) -> int:
-        """Return the number of tasks of a job with these parameters and inputs; 1 if the kind has no `task_count`."""
+        """Return the number of tasks that `task_count` gives for these parameters and inputs; without it, 1.
+
+        The tasks into which `fan_out` divides a job are not counted.
+        """
         if self.task_count is None:
             return 1
         return self.task_count(params, *([] if self.counted is None else [len(inputs.get(self.counted, ()))]))

@@ -165,7 +165,10 @@ def conditions_of(operation: Operation) -> str:
     if operation.in_folders:
         who += " or in the folder"
     if operation.scope is not None:
-        who += f", and the scope `{operation.scope}`"
+        if operation.access is Access.ANYONE:
+            who += f"; a token that is sent needs the scope `{operation.scope}`"
+        else:
+            who += f", and the scope `{operation.scope}`"
     sentences = [who]
     if role is Role.READER and operation.public:
         sentences.append("In public projects, no token is needed")

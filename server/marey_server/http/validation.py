@@ -79,7 +79,7 @@ def stated_size(compressed: bytes, most_bytes: int) -> int:
     except CompressionError as error:
         raise _not_compressed(error) from None
     if size > most_bytes:
-        raise TooLargeProblem(f"The compressed body contains {size} bytes; this address accepts at most {most_bytes}.")
+        raise TooLargeProblem(f"Decompressed, the body has {size} bytes; this address accepts at most {most_bytes}.")
     return size
 
 

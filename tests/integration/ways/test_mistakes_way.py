@@ -46,6 +46,7 @@ MISTAKES: tuple[tuple[str, int, str], ...] = (
     ("ls lba", 1, "; did you mean lab?"),
     ("upload half.bvh --project lab/walks", 2, "'lab', and the folder 'walks' apart from it"),
     ("ls ./lab/walks", 2, "did you mean 'lab/walks'?"),
+    ("ls .", 2, "'.' is not the address of a folder or an item; write project/folder/name"),
     (r"show 'lab\walks\x'", 2, "did you mean 'lab/walks/x'?"),
     ("ls lab/wakls", 2, "there is no item or folder at lab/wakls; did you mean lab/walks?"),
     ("show 'lab/walks/walk 1 0.bvh'", 2, "did you mean 'lab/walks/walk 1 0'?"),

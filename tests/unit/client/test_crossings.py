@@ -101,7 +101,8 @@ def test_versions_that_cannot_be_evaluated_are_suspects() -> None:
         ((1.0, 1.0), None, "offset_mean_m is 1 at the good version and 1 at the bad one, so no value is half-way"),
         ((2.0, 3.0), Limit(1.0), "values above 1 are bad, so both versions are bad"),
         ((0.5, 0.7), Limit(1.0), "values above 1 are bad, so both versions are good"),
-        ((0.5, 0.7), Limit(0.6, above=False), "values below 0.6 are bad, so both versions are bad"),
+        ((7.0, 3.0), Limit(5.0), "so the good version is bad and the bad one is good; exchange the versions"),
+        ((0.5, 0.7), Limit(0.6, above=False), "values below 0.6 are bad, so the good version is bad and the bad"),
     ],
 )
 def test_ends_that_do_not_enclose_the_limit_are_refused(

@@ -105,9 +105,9 @@ class AsyncProposalHandle(Counterpart):
     ) -> Proposal:
         """Merge the proposal; with `when_green`, the server merges it as soon as all requirements are met.
 
-        Raises `Conflict` with one of three codes. `proposal-not-green`: requirements are not met; `missing` in the
-        context of the error lists them. `merge-conflicts`: `resolutions` do not decide all conflicts. `proposal-moved`:
-        `commit` is given and is not the newest commit.
+        Raises `Conflict`. Its code says why: `proposal-not-green`: requirements are not met; `missing` in the context
+        of the error lists them. `merge-conflicts`: `resolutions` do not decide all conflicts. `proposal-moved`:
+        `commit` is given and is not the newest commit. `proposal-merged`, `proposal-closed`: the proposal has ended.
         """
         return await self._run(
             self._sync.merge, message=message, resolutions=resolutions, when_green=when_green, commit=commit

@@ -60,8 +60,9 @@ def push(
     """Copy a version and all versions before it to a dataset on another server, or in another project.
 
     Only data that the other dataset lacks is sent, and the versions keep their digests, authors and times. A tag is
-    copied with its version. The copy changes no folder: check out the version to get its clips. If the target branch
-    has versions that your dataset lacks, the target branch does not move: pull these versions, merge, and push again.
+    copied if you name it (lab/gaits@v1), unless the other dataset has a branch or tag of this name. The copy changes no
+    folder: check out the version to get its clips. If the target branch has versions that your dataset lacks, the
+    target branch does not move: pull these versions, merge, and push again.
     """
     with connect(context) as here, connect_other(to, token_file, here) as there:
         _copy(here, there, place, target, branch, as_json, server=to)
@@ -82,8 +83,9 @@ def pull(
     """Copy a version and all versions before it from a dataset on another server, or in another project.
 
     Only data that your dataset lacks is fetched, and the versions keep their digests, authors and times. A tag is
-    copied with its version. The copy changes no folder: check out the version to get its clips. If your branch has
-    versions that the other dataset lacks, the branch does not move, and the command prints how to merge.
+    copied if you name it (lab/gaits@v1), unless your dataset has a branch or tag of this name. The copy changes no
+    folder: check out the version to get its clips. If your branch has versions that the other dataset lacks, the branch
+    does not move, and the command prints how to merge.
     """
     with connect(context) as here, connect_other(source, token_file, here) as there:
         _copy(there, here, place, target, branch, as_json)

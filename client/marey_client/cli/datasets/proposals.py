@@ -238,7 +238,8 @@ def check(
     job: Annotated[
         str | None,
         typer.Option(
-            help="Id of the job that ran the check. The state `succeeded` is accepted only if this job has succeeded."
+            help="Id of the job that ran the check. The state `succeeded` is accepted only if this job has succeeded "
+            "and, if it read versions of datasets, has read the newest commit of the proposal."
         ),
     ] = None,
     link: Annotated[str | None, typer.Option(help="Address of a page about the check.")] = None,

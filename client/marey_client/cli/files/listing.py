@@ -85,7 +85,8 @@ def ls(
     stale: Annotated[
         bool,
         typer.Option(
-            "--stale", help="List only stale results: items that a job made of an input that has a newer revision now."
+            "--stale",
+            help="List only stale results: items of which a direct or indirect input has a newer revision now.",
         ),
     ] = False,
     sort: Annotated[

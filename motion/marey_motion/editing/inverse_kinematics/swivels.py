@@ -84,10 +84,12 @@ def _limb_speeds(limb: Any, problem: IkProblem, rotations: Floats) -> tuple[Floa
 
 
 def _even_swivels(goal: Floats, jumps: Floats, clear: Floats, reach: float) -> Floats:
-    """Compute swivels (n,) near the desired swivels, with which the change of the limb varies slowly.
+    """Compute swivels (n,) that are near the desired swivels `goal` and turn the limb evenly from frame to frame.
 
-    Minimises Σ c (a - w)² + reach² Σ (Δa + jump)² over the swivels a. The desired swivels w are angles on a circle; the
-    weights c, from 0 to 1, are small where a desired swivel is ambiguous. All angles are in radians.
+    Minimises Σ clear (a - goal)² + reach² Σ (Δa + jumps)² over the swivels a. `goal` contains angles on a circle;
+    `clear`, from 0 to 1, is small where a desired swivel is ambiguous; `jumps` is the swivel of the uncorrected limb
+    from the frame before to each frame; and `reach` is the number of frames over which swivels are smoothed. All angles
+    are in radians.
     """
     from scipy.linalg import solveh_banded
 

@@ -72,7 +72,7 @@ _DEPENDENCIES = Prepared(
 def _after(tx: Transaction, rows: Sequence[Row[Any]]) -> dict[str, tuple[str, ...]]:
     """Return the ids of the jobs on which each job depends, by job; jobs without dependencies are left out.
 
-    The job whose result a job waits to share is no dependency in this sense.
+    A job can also wait for an equal job, to take over its result (`cached_from`); that job is not counted.
     """
     shared = {row.id: row.cached_from for row in rows}
     found: dict[str, tuple[str, ...]] = {}

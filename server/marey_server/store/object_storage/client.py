@@ -88,7 +88,7 @@ class StoredObject:
 
     @classmethod
     def parse(cls, name: str) -> Self | None:
-        """Return the `StoredObject` with the name `name`; None if no blob's object has such a name."""
+        """Parse the name of an object, without looking for it; None if the name has not the form of a blob's name."""
         parts = name.split("/")
         if len(parts) != 4 or parts[0] != BLOBS or len(parts[3]) != 33:
             return None
