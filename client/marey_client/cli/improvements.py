@@ -167,13 +167,16 @@ def print_findings(
 
 def _print_suggestions(document: Mapping[str, Any]) -> None:
     unused, redundant = document["unused"], document["redundant"]
+    plan = redundant["plan"]
+    harmless = redundant.get("harmless_steps", len(plan))  # workers of older versions do not count them
     sections = (
         (f"{counted(len(unused['clips']), 'clip')} ({_seconds(unused['clips'])}) can be removed without changing any "
          "trial", unused["clips"]),
         (f"{counted(len(unused['ranges']), 'range')} of clips ({_seconds(unused['ranges'])}) can be cut off with "
          "hardly any change", unused["ranges"]),
-        (f"{counted(len(redundant['plan']), 'clip')} to {'then ' if unused['clips'] else ''}remove, one after another; "
-         f"{redundant['tried']} of {redundant['needed']} used clips were tried", redundant["plan"]),
+        (f"{counted(harmless, 'clip')} to {'then ' if unused['clips'] else ''}remove, one after another; "
+         f"{redundant['tried']} of {redundant['needed']} used clips were tried", plan[:harmless]),
+        ("What still further removals cost", plan[harmless:]),
         (f"{counted(len(document['near_duplicates']['pairs']), 'pair')} of clips with nearly the same motion, within "
          f"{document['near_duplicates']['threshold_cm']:g} cm", document["near_duplicates"]["spared"]),
         (f"{counted(len(document['fillings']), 'clip')} would fill gaps in the coverage", document["fillings"]),

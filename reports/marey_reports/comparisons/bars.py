@@ -77,7 +77,7 @@ def _draw_row(panel: Axes, row: int, point: Point, *, bars: bool) -> None:
         panel.plot([summary.low, summary.high], [row, row], color=INK, ls="", marker="|", ms=7, mew=1.3, zorder=3)
     if summary.n > 1:
         panel.plot(point.numbers, np.full(summary.n, row), ls="", marker="o", ms=3.6, color=COLOURS[0], alpha=0.75,
-                   mew=0, zorder=4)  # fmt: skip
+                   mec=INK, mew=0.4, zorder=4)  # fmt: skip
         panel.plot([summary.mean] * 2, [row - 0.31, row + 0.31], color=INK, lw=1.8, zorder=5)
     else:
         panel.plot([summary.mean], [row], ls="", marker="o", ms=4.6, color=COLOURS[0], zorder=4)

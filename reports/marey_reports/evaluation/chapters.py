@@ -202,11 +202,12 @@ def baseline_chapter(result: EvaluationResult) -> Section:
             row.append(_interval(baseline_runs.interval(name), metric.digits))
         rows.append([*row, metric.unit])
     pooled = HOW_POOLED if replicates is None else f"{HOW_POOLED} {_replicated(replicates)}"
+    marked = f"{MARKED} Limits that depend on the desired speed of a trial are not applied to them."
     about = (
-        f"{pooled} {MARKED} The baseline is the same suite with generated clips, one for each speed and turn rate. "
+        f"{pooled} {marked} The baseline is the same suite with generated clips, one for each speed and turn rate. "
         "It shows the results of the same motion matching if no data is missing."
         if base is not None
-        else f"{pooled} {MARKED} No baseline was evaluated."
+        else f"{pooled} {marked} No baseline was evaluated."
     )
     listing = table("Metrics of the suite", heads, rows, numbers=range(1, len(heads) - 1), sortable=False)
     return Section("numbers", "Metrics", (element("p", about), listing))

@@ -84,8 +84,12 @@ def _numbers(found: Suggestions) -> Html:
     return facts(
         (
             ("Unused clips", str(len(found.unused.clips)), f"{found.unused.seconds:.1f} s with unused ranges"),
-            ("Further removals", str(len(found.plan)), f"{found.tried[0]} of {found.tried[1]} used clips were tried"),
-            ("Near-duplicates", str(len(found.duplicates.pairs)), f"within {found.duplicates.threshold_cm:g} cm"),
+            (
+                "Further removals",
+                str(found.harmless_steps),
+                f"{found.tried[0]} of {found.tried[1]} used clips were tried",
+            ),
+            ("Near-duplicates", str(len(found.spared)), f"within {found.duplicates.threshold_cm:g} cm"),
             ("Coverage", f"{100 * found.result.coverage.index:.0f} %", filled),
         )
     )
@@ -93,7 +97,6 @@ def _numbers(found: Suggestions) -> Html:
 
 def _chapters(found: Suggestions) -> tuple[_Chapter, ...]:
     """Return all chapters in the order of the page, also those without suggestions."""
-    trials = len(found.result.trials)
     look_same = None if found.metric is None else indistinguishable(found.metric)
     confirmed = found.confirmed
     unused = "" if confirmed is None or confirmed.unused is None else reasons.why_unused_again(confirmed.unused)
@@ -107,12 +110,7 @@ def _chapters(found: Suggestions) -> tuple[_Chapter, ...]:
             "ranges", "Ranges that no trial uses", ranges,
             tuple(ShownSuggestion(reasons.why_unused_range(one), ()) for one in found.unused.ranges),
         ),
-        _Chapter(
-            "removals", "Clips to remove, one after another", "Each effect is measured without all clips above it.",
-            tuple(
-                _about(step.removal, reasons.why_redundant(step.removal, trials, step.confirmed)) for step in found.plan
-            ),
-        ),
+        *_removals(found),
         _Chapter(
             "duplicates", "Clips with nearly the same motion", "Below each clip stands the one that is like it.",
             tuple(
@@ -132,6 +130,24 @@ def _chapters(found: Suggestions) -> tuple[_Chapter, ...]:
             ),
         ),
     )  # fmt: skip
+
+
+def _removals(found: Suggestions) -> tuple[_Chapter, _Chapter]:
+    """Return the chapters about removals that do not harm, and about those from the first harmful one on."""
+    trials = len(found.result.trials)
+    steps = tuple(
+        _about(step.removal, reasons.why_redundant(step.removal, trials, step.confirmed)) for step in found.plan
+    )
+    about = "Each effect is measured without all clips above it."
+    return (
+        _Chapter("removals", "Clips to remove, one after another", about, steps[: found.harmless_steps]),
+        _Chapter(
+            "costs",
+            "What still further removals cost",
+            f"From here on, trials depart further from their paths. {about}",
+            steps[found.harmless_steps :],
+        ),
+    )
 
 
 def _about(clip: UnusedClip | Removal | Filling, reason: str) -> ShownSuggestion:

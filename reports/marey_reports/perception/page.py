@@ -89,8 +89,8 @@ def _verdict(subject: ComparedSet) -> str:
     if len(ranked) == 1:
         return f"The perceptual distance of {names[i]} and {names[j]} is {totals[i, j]:.3f}."
     return (
-        f"Of {counted(len(subject.clips), 'clip')}, {names[i]} and {names[j]} are the most similar, with a perceptual "
-        f"distance of {totals[i, j]:.3f}; {names[k]} and {names[m]} differ most, with {totals[k, m]:.3f}."
+        f"Of {counted(len(subject.clips), 'clip')}, {names[i]} and {names[j]} have the smallest perceptual "
+        f"distance, {totals[i, j]:.3f}; {names[k]} and {names[m]} the greatest, {totals[k, m]:.3f}."
     )
 
 
@@ -165,7 +165,9 @@ def _metric(subject: ComparedSet) -> Html:
         "angle", "side_reduce", "identity", "root_alignment", "length_unit_m", "velocity_interval_s", "frame_rate_hz",
         "code_version",
     })  # fmt: skip
-    conventions = [(name, str(value)) for name, value in options.items()]
+    conventions = [
+        (name, f"{value:.6g}" if isinstance(value, float) else str(value)) for name, value in options.items()
+    ]
     conventions.append(("digest", MetricIdentity.of(metric).digest))
     return joined(
         (

@@ -10,6 +10,7 @@ from tests.support.synthetic_databases import arc_track, synthetic_database
 from marey_motion.clip import Clip
 from marey_motion.evaluation.improvement import reasons
 from marey_motion.evaluation.improvement.suggest import Suggestions, suggest
+from marey_motion.evaluation.improvement.suggestion_documents import suggestions_to_tree
 from marey_motion.gait import generate_gait
 from marey_reports.drawing.strips import even_frames
 from marey_reports.evaluation.suggestions import MOST_DRAWN, Poses, render_suggestions, shown_sources
@@ -52,6 +53,27 @@ def test_every_suggestion_is_on_the_page_with_its_reason(found: Suggestions, pos
     assert len(expected) > 6
     assert [reason for reason in expected if reason not in page.text] == []
     assert f"Coverage {100 * found.result.coverage.index:.0f} %" in page.text
+
+
+def test_removals_after_which_trials_depart_further_are_not_called_clips_to_remove(
+    found: Suggestions, poses: Poses
+) -> None:
+    first, second = found.plan
+    assert first.confirmed is not None
+    change = replace(first.confirmed.headlines["offset_mean"], change=0.03, low=0.02, high=0.04, p=1e-6)
+    worse = replace(first.confirmed, headlines={**first.confirmed.headlines, "offset_mean": change})
+    assert change.verdict == "worse"
+    for plan, harmless in (((first, second), 2), ((first, replace(second, confirmed=worse)), 1)):
+        changed = replace(found, plan=plan)
+        assert changed.harmless_steps == harmless
+        page = is_sound(render_suggestions(changed, poses, title="lab/walks-eval"))
+        _, *parts = page.text.split("What still further removals cost")  # in the contents, and as a heading
+        listed = parts[0] if parts else page.text
+        trials = len(found.result.trials)
+        texts = [reasons.why_redundant(step.removal, trials, step.confirmed) for step in plan]
+        assert [text in listed for text in texts] == [number < harmless for number in range(2)]
+    tree = suggestions_to_tree(changed)
+    assert tree["redundant"]["harmless_steps"] == 1
 
 
 def test_the_clips_of_the_first_suggestions_are_drawn_and_the_twin_of_a_duplicate_too(found: Suggestions) -> None:

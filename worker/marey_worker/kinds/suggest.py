@@ -143,7 +143,7 @@ def _counts(found: Suggestions) -> dict[str, Any]:
     return {
         "unused_clips": len(found.unused.clips),
         "unused_s": found.unused.seconds,
-        "removals": len(found.plan),
+        "removals": found.harmless_steps,
         "near_duplicates": len(found.duplicates.pairs),
         "blendable_share": found.similarity.share,
         "fillings": len(found.fillings),

@@ -21,7 +21,7 @@ from marey_motion.evaluation.improvement.duplicates import (
     find_near_duplicates,
     spared_sources,
 )
-from marey_motion.evaluation.improvement.effects import estimation_replicates
+from marey_motion.evaluation.improvement.effects import Effect, estimation_replicates
 from marey_motion.evaluation.improvement.filling import Addition, Filling, plan_fillings, rank_fillings
 from marey_motion.evaluation.improvement.lost_poses import LostPoses
 from marey_motion.evaluation.improvement.redundancy import (
@@ -86,6 +86,16 @@ class Suggestions:
     metric: MetricDocument | None = None
     confirmed: Confirmed | None = None
     defects: Mapping[str, Defects] = field(default_factory=dict)
+
+    @property
+    def harmless_steps(self) -> int:
+        """Number of steps of the plan before the first one that was confirmed to move trials away from their paths."""
+        worse = (number for number, step in enumerate(self.plan) if step.confirmed and _departs(step.confirmed))
+        return next(worse, len(self.plan))
+
+
+def _departs(effect: Effect) -> bool:
+    return effect.headlines["offset_mean"].verdict == "worse"
 
 
 def suggest(

@@ -161,6 +161,7 @@ def _redundant_to_tree(suggestions: Suggestions) -> Tree:
     return {
         "tried": suggestions.tried[0],
         "needed": suggestions.tried[1],
+        "harmless_steps": suggestions.harmless_steps,
         "clips": [{**_removal_to_tree(removal), **reason_for(removal)} for removal in suggestions.redundant],
         "plan": [
             {**_plain(step), "removal": _removal_to_tree(step.removal), **reason_for(step.removal, step.confirmed)}

@@ -144,4 +144,7 @@ def _caption(subjects: Sequence[Subject], strips: Sequence[dict[str, _Strip]]) -
         parts.append(
             f"{subject.prefix}{share} of all frames were displayed at least once in the suite; {len(each)} clips drawn."
         )
-    return "Darker parts were displayed more often, and white parts never. " + " ".join(parts)
+    return (
+        "The stronger the colour of a part, the more often it was displayed; parts without colour never were. "
+        + " ".join(parts)
+    )

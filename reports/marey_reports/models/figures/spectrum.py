@@ -147,7 +147,7 @@ def draw_criterion(subject: ModelSubject) -> Sketch | None:
     taken = [each for each in candidates if (each.components, each.covariance) == (chosen, covariance)]
     figure = new_figure(9.6, 3.3)
     measured = any(each.held_out_log_likelihood is not None for each in candidates)
-    panels = [("held_out_log_likelihood", "likelihood of left-out takes (higher is better)")] if measured else []
+    panels = [("held_out_log_likelihood", "log-likelihood of left-out takes (higher is better)")] if measured else []
     panels.append(("bic", "BIC (lower is better)"))
     drawn = []
     for place, (name, label) in enumerate(panels):
