@@ -185,7 +185,7 @@ def test_one_death_in_an_indexed_job_ends_no_other_worker(bench: Bench, cluster:
 def test_workers_of_an_indexed_job_that_has_not_started_are_not_stopped_alone(bench: Bench) -> None:
     bench.launcher = bench.make(indexed=True, queue="motion")
     names = bench.start(2)
-    with pytest.raises(EngineError, match="cannot be stopped before they have pods: marey-crew-k1-0"):
+    with pytest.raises(EngineError, match="cannot be stopped yet, because they have no pods: marey-crew-k1-0"):
         bench.do(bench.launcher.stop(names[:1]))
     bench.do(bench.launcher.stop(names))
     assert bench.states() == {}

@@ -281,7 +281,12 @@ def exceeded_in_suite(result: EvaluationResult) -> frozenset[str]:
     frozenset of str    names of metrics
     """
     suite, limits = result.suite, result.options.limits
-    checks = (*_turn_checks(suite, limits), *_response_checks(suite, limits), *_looks_checks(suite, limits))
+    checks = (
+        *_turn_checks(suite, limits),
+        _check("turn", suite, "abs_se_omega_deg", limits.turn_deg_s),  # errors to the left and to the right cancel out
+        *_response_checks(suite, limits),
+        *_looks_checks(suite, limits),
+    )
     return frozenset(each.metric for each in checks if each.exceeded and each.value is not None)
 
 

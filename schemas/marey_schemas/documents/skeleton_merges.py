@@ -1,4 +1,4 @@
-"""Merges of skeletons: duplicates of one rig become one skeleton, to which their clips move."""
+"""Merges of skeletons: duplicates of one rig become one skeleton, to which their clips and models move."""
 
 from __future__ import annotations
 

@@ -342,10 +342,10 @@ def test_numbers_beyond_their_limits_are_marked_where_they_stand(result: Evaluat
     bad = replace(
         result,
         trials=(replace(result.trials[0], metrics=metrics), *result.trials[1:]),
-        suite={**result.suite, **metrics, "treading_share": 0.63},
+        suite={**result.suite, **metrics, "treading_share": 0.63, "abs_se_omega_deg": 44.1},
     )
     page = render_report(bad, title="t", figures={})
-    for written in ("0.87", "9.90", "2.50", "0.63"):
+    for written in ("0.87", "9.90", "2.50", "0.63", "44.1"):
         assert re.search(rf'<td[^>]*class="[^"]*bad[^"]*"[^>]*>{written}</td>', page), written
 
 

@@ -92,7 +92,9 @@ class KubernetesLauncher:
         await self._jobs.all(deletions)
         if without_pod:
             listed = ", ".join(sorted(without_pod))
-            raise EngineError(f"workers of an Indexed Job cannot be stopped before they have pods: {listed}")
+            raise EngineError(
+                f"these workers of an Indexed Job cannot be stopped yet, because they have no pods: {listed}"
+            )
 
     async def why_ended(self, name: str) -> WorkerEnd | None:
         """Return why a worker ended, according to its pod or its Job.

@@ -119,7 +119,7 @@ class _Family:
     def _take(self, rows: Mapping[str, Row[Any]], needs: Mapping[str, dict[str, str]]) -> None:
         if any(row.propagation_rank is not None for row in rows.values()):
             raise UnavailableProblem(
-                "The end of a job that would be retried is still being processed; try again in a few seconds.",
+                "A job to be retried has just ended, and the server still stores its end; try again in a few seconds.",
                 code="still-ending",
                 headers={"Retry-After": "1"},
             )
