@@ -361,6 +361,12 @@ def test_an_unknown_or_unfit_query_parameter_is_named(owner: httpx.Client) -> No
     assert {error["pointer"] for error in refused.json()["errors"]} == {"limit", "frames.gte"}
 
 
+def test_an_address_that_is_not_utf8_is_refused_with_the_part_that_is_not(owner: httpx.Client) -> None:
+    refused = owner.get("/projects/lab/clips/%FF")
+    assert (refused.status_code, refused.json()["code"]) == (400, "not-utf8")
+    assert refused.json()["detail"] == "The part 'item' of the address must be percent-encoded UTF-8."
+
+
 def test_a_cursor_of_another_list_or_made_up_is_refused(owner: httpx.Client) -> None:
     for number in range(3):
         make(owner, "skeletons", f"s{number}", hierarchy=HIERARCHY)

@@ -20,6 +20,7 @@ from marey_schemas.sizes import KIB, MIB
 from marey_schemas.tracing.context import HEADER
 from marey_server.errors import (
     ApiProblem,
+    BadRequestProblem,
     DamagedProblem,
     MethodNotAllowedProblem,
     StoppingProblem,
@@ -113,6 +114,14 @@ class Exchange(RequestHandler):
         peer = self.request.remote_ip or ""
         named = self.request.headers.get(settings.proxy_header) if settings.trust_proxy else None
         return peer if named is None else forwarded_address(named, settings.proxy_hops) or peer
+
+    def decode_argument(self, value: bytes, name: str | None = None) -> str:
+        """Decode a part of the path of the address. Raises `BadRequestProblem` if it is not UTF-8."""
+        try:
+            return value.decode()
+        except UnicodeDecodeError:
+            where = f"The part {name!r} of the address" if name else "The address"
+            raise BadRequestProblem(f"{where} must be percent-encoded UTF-8.", code="not-utf8") from None
 
     # -- the body that comes ------------------------------------------------------------------------------------------
 
