@@ -213,9 +213,18 @@ def _count_brackets(data: bytes) -> int:
 def _parse_msgpack(data: bytes) -> Any:
     count = _Count(data)
     # The parser allocates what a header claims before it reads on, so claims are limited.
-    return msgpack.unpackb(
-        data, object_pairs_hook=count.on_object, list_hook=count.on_list, max_array_len=MAX_LIST, max_map_len=MAX_LIST
-    )
+    try:
+        return msgpack.unpackb(
+            data,
+            object_pairs_hook=count.on_object,
+            list_hook=count.on_list,
+            max_array_len=MAX_LIST,
+            max_map_len=MAX_LIST,
+        )
+    except msgpack.ExtraData as error:  # the texts of these two errors name functions of the parser, or are empty
+        raise ValueError("bytes follow the end of the document") from error
+    except msgpack.FormatError as error:
+        raise ValueError("the byte 0xc1 cannot begin a value") from error
 
 
 def _most_lists(data: bytes) -> int:

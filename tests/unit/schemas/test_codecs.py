@@ -173,6 +173,17 @@ def test_messagepack_that_other_formats_could_not_carry_is_refused(data: bytes, 
     assert refusal(data, MSGPACK).code == code
 
 
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b'{"name": "lab"}', "bytes follow the end of the document"),
+        (b"\x91\xc1", "the byte 0xc1 cannot begin a value"),
+    ],
+)
+def test_malformed_messagepack_is_explained_without_words_of_the_parser(data: bytes, reason: str) -> None:
+    assert str(refusal(data, MSGPACK)) == f"document: the document is not valid application/msgpack: {reason}"
+
+
 @pytest.mark.parametrize("header", [b"\xdd", b"\xdf"])
 def test_messagepack_cannot_claim_its_way_to_memory(header: bytes) -> None:
     claim = header + struct.pack(">I", MAX_LIST) + (b"\xa1a" if header == b"\xdf" else b"")
