@@ -150,10 +150,9 @@ class _HierarchyReader:
         elif keyword.startswith(b"FRAME") and self.header.names and not self.open:
             raise self.lines.error("the line MOTION is missing before this line; add it", code="motion-missing")
         else:
-            raise self.lines.error(
-                f"expected ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace, not {excerpt(piece)!r}",
-                joint=self._joint_name(),
-            )
+            ended = self.header.names and not self.open
+            expected = "MOTION" if ended else "ROOT, JOINT, End Site, OFFSET, CHANNELS or a brace"
+            raise self.lines.error(f"expected {expected}, not {excerpt(piece)!r}", joint=self._joint_name())
 
     def _begin_joint(self, keyword: bytes, rest: bytes) -> None:
         header = self.header

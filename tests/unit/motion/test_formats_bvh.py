@@ -265,6 +265,7 @@ class TestRefusals:
             ),
             (bvh().replace(b"CHANNELS 3 Zrotation", b"CHANNELS 3 Zscale"), 9, "Arm", "Zscale"),
             (bvh().replace(b"JOINT Arm", b"BONE Arm"), 6, "Hips", "BONE"),
+            (bvh([ROW]).replace(b"MOTION", b"MOTON"), 16, None, "expected MOTION, not 'MOTON'"),
             (bvh().replace(b"JOINT Arm\n  {", b"JOINT Arm\n"), 8, "Arm", "must be followed by {, not"),
             (bvh().replace(b"JOINT Arm\n  {", b"JOINT Arm\n  {\n{"), 8, "Arm", "this { does not follow"),
             (bvh(hierarchy=ARM + ARM.replace("HIERARCHY\n", "")), 16, None, "second ROOT"),
