@@ -66,7 +66,7 @@ def detect_format(data: bytes, name: str) -> FileFormat:
         )
     found = next((one for one in FORMATS if one.begins is not None and one.begins.search(start)), named)
     if found is None:
-        endings = sorted({ending for one in IMPORTED for ending in one.endings + one.other_endings})
+        endings = sorted({ending for one in IMPORTED if one.reads for ending in one.endings + one.other_endings})
         raise UnknownFormat(
             f"the format of this file, which begins with {excerpt(data[:16])!r}, is not known; files with "
             f"these endings can be imported: {', '.join(endings)}",

@@ -53,6 +53,12 @@ def test_what_no_reader_knows_is_refused_with_a_reason(data: bytes, name: str, c
     assert (refused.value.code, refused.value.file) == (code, name)
 
 
+def test_the_endings_that_an_unknown_file_could_have_are_those_that_have_a_reader() -> None:
+    with pytest.raises(UnknownFormat, match=r"\.bvh") as refused:
+        detect_format(b"rubbish", "take.xyz")
+    assert ".c3d" not in str(refused.value)
+
+
 @pytest.mark.parametrize(
     ("data", "name", "kind"),
     [
