@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _WITH_CHOICES = re.compile(r"^('.*' is not one of ((?:'[^']*'(?:, )?)+))\.$")
 """Pattern of typer's messages about options with choices."""
 _QUOTED = re.compile(r"'([^']*)'")
+_BOUNDS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
 
 def plain_reason(fault: Mapping[str, Any], model: type[BaseModel] | None = None) -> str:
@@ -39,6 +40,8 @@ def plain_reason(fault: Mapping[str, Any], model: type[BaseModel] | None = None)
         if fault["loc"][-1] in known:  # a field of another type of a union
             return "this field cannot be combined with the others of this object"
         return f"there is no field of this name{_suggestion(fault, known)}"
+    if kind in _BOUNDS and str(fault.get("input")).strip().lower() in ("nan", "+nan", "-nan"):
+        kind = "finite_number"  # pydantic compares NaN with a bound before it finds that NaN is not finite
     if kind.endswith(("too_short", "too_long")):
         return _length_reason(kind, fault["ctx"])
     reason = _REASONS.get(kind, "the value does not have the required form").format(**context)

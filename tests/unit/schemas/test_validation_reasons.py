@@ -94,6 +94,13 @@ def test_a_fault_is_explained_with_its_place_in_plain_words(given: Any, expected
     assert first_reason(refused.value, Session, given) == expected
 
 
+@pytest.mark.parametrize("weight", [float("nan"), "NaN"])
+def test_nan_is_explained_as_not_finite_and_not_by_a_bound(weight: Any) -> None:
+    with pytest.raises(ValidationError) as refused:
+        Exercise.model_validate({"kind": "exercise", "weight_kg": weight})
+    assert first_reason(refused.value, Exercise) == "weight_kg: the value must be a finite number"
+
+
 def test_a_value_that_fits_no_type_of_a_union_gets_the_reasons_of_all() -> None:
     class Found(BaseModel):
         at: int | Literal["end"]
