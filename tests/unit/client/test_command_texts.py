@@ -68,6 +68,7 @@ def test_the_text_of_a_command_is_read_as_the_same_command(command: dict[str, An
     [
         ("wobble", "there is no command 'wobble'; the commands are trim"),
         ("", "there is no command"),
+        ("smooth frames=10-20", "'10-20' is not a range of frames; write first:stop, as in 10:20"),
         ("trim begin=3", "trim has no parameter 'begin'; it has start, stop"),
         ("mirror left=1", "mirror has no parameter 'left'; it has none"),
         ("trim 3", "write parameter=value"),

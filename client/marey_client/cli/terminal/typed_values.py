@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -23,6 +24,7 @@ MOST_DIGITS = 18
 MOST_VALUES = 200
 """Greatest number of values in a range if the schema sets no limit."""
 EVEN = 1e-9
+_HYPHENATED = re.compile(r"\d+-\d+")
 GREATEST_SHOWN_BOUND = 1e15
 """Absolute value from which a bound is not shown, because such bounds are limits of integers, not of a parameter."""
 
@@ -145,7 +147,10 @@ def assignment(text: str) -> tuple[str, str]:
 
 
 def read_value(text: str, schema: Schema) -> Any:
-    """Parse a text as a value of the schema's type; lists are JSON or `1,2,3`, ranges of frames are `10:200`."""
+    """Parse a text as a value of the schema's type; lists are JSON or `1,2,3`, ranges of frames are `10:200`.
+
+    Raises `WrongUsage` for a range of frames with a hyphen.
+    """
     if _takes(schema, "null") and text == "null":
         return None
     if _takes(schema, "string"):
@@ -157,6 +162,8 @@ def read_value(text: str, schema: Schema) -> Any:
     bounds = text.split(":")
     if len(bounds) == 2 and all(not bound or is_frame(bound) for bound in bounds):
         return [int(bounds[0] or 0), int(bounds[1]) if bounds[1] else None]
+    if _HYPHENATED.fullmatch(text) and any("prefixItems" in one for one in _choices(schema)):
+        raise WrongUsage(f"{text!r} is not a range of frames; write first:stop, as in {text.replace('-', ':')}")
     of_text = any(one.get("items", {}).get("type") == "string" for one in _choices(schema))
     return [one if of_text else json_or_text(one) for one in text.split(",")]
 
