@@ -86,11 +86,11 @@ def require_item(marey: Marey, address: Address, kinds: Sequence[Kind]) -> Any:
     found = find_item(marey, address, kinds)
     if found is None:
         wanted = " or ".join(kind.value for kind in kinds) if len(kinds) <= 2 else "item"
-        raise _missing(marey, address, f"no {wanted}", kinds)
+        raise missing_place(marey, address, f"no {wanted}", kinds)
     return found
 
 
-def _missing(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -> WrongUsage:
+def missing_place(marey: Marey, address: Address, what: str, kinds: Iterable[Kind]) -> WrongUsage:
     """Return the error for an address without an item of these kinds, with the nearest address or other advice."""
     from marey_schemas.kinds import Kind
 
@@ -271,7 +271,7 @@ def folder_or_item(marey: Marey, text: str, kind: str | None, *, deleted: bool =
         raise WrongUsage(f"several items are called {address}: a {' and a '.join(kinds)}; choose one with --kind")
     if not found:
         if not deleted:
-            raise _missing(marey, address, "no item or folder", _kinds_of(kind))
+            raise missing_place(marey, address, "no item or folder", _kinds_of(kind))
         raise WrongUsage(
             f"there is no deleted item or folder at {address}; `marey ls --deleted {address.project}` lists all that "
             "are deleted"

@@ -65,6 +65,8 @@ MISTAKES: tuple[tuple[str, int, str], ...] = (
         2,
         "there is no skeleton at lab/walks/walk 1 0, but a clip; `marey show 'lab/walks/walk 1 0'` shows it",
     ),
+    ("edit apply 'lab/walks/walk 1 o' --into e --do mirror", 2, "did you mean 'lab/walks/walk 1 0'?"),
+    ("quality lab/wakls", 2, "there is no clip and no folder at lab/wakls; did you mean lab/walks?"),
     ("model lab/walks --into models", 1, "contains no aligned clip; align its clips first"),
     ("why lab/walks", 2, "'lab/walks' is not the id of a job"),
     # unknown words

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from marey_client.cli.addresses import Address
+from marey_client.cli.addresses import Address, missing_place
 from marey_client.cli.revisions import find_revision, find_version
 from marey_client.cli.terminal.failures import Refused, WrongUsage
 from marey_client.cli.terminal.output import print_json, print_message, print_refused
@@ -101,7 +101,7 @@ def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True)
     """Return the input of a job at an address: an item, its revision after `@`, a version of a dataset, or a folder.
 
     For an item without `@`, the input is the newest revision: the newest one now if `pinned` is true, otherwise the
-    newest one when the job is submitted.
+    newest one when the job is submitted. Raises `WrongUsage` if there is nothing at the address.
     """
     from marey_schemas.queue.jobs import CollectionInput, ItemInput
 
@@ -109,7 +109,13 @@ def input_at(marey: Marey, address: Address, kind: Kind, *, pinned: bool = True)
     if found is not None:
         item, revision = found
         return ItemInput(item=item.id, revision=revision or (item.item.revision if pinned else None))
-    return find_version(marey, address) or CollectionInput(collection=address.path)
+    version = find_version(marey, address)
+    if version is not None:
+        return version
+    named = address.path and not address.is_folder  # not the project, nor a folder by a final slash
+    if named and marey.project(address.project).collections.at(address.path) is None:
+        raise missing_place(marey, address, f"no {kind.noun} and no folder", [kind])
+    return CollectionInput(collection=address.path)
 
 
 def follow(
