@@ -22,7 +22,8 @@ _CODE = re.compile(r"^\s*```.*?^\s*```|`[^`]+`", re.MULTILINE | re.DOTALL)
 # Called by a framework: Tornado, pydantic, logging, SQLAlchemy, httpx.
 _CALLED_BY_NAME = {
     "get", "head", "post", "put", "patch", "delete", "options", "initialize", "prepare", "data_received", "on_finish",
-    "on_connection_close", "write_error", "log_exception", "set_default_headers", "compute_etag", "find_handler",
+    "on_connection_close", "decode_argument",
+    "write_error", "log_exception", "set_default_headers", "compute_etag", "find_handler",
     "emit", "format", "formatTime", "formatException", "filter", "convert", "run", "gather", "process_bind_param",
     "process_result_value", "auth_flow", "settings_customise_sources",
 }  # fmt: skip
