@@ -94,11 +94,13 @@ class House:
     modules: dict[str, Module]
     pages: dict[Path, str] = field(default_factory=dict)
     users: dict[Path, str] = field(default_factory=dict)
+    stubs: dict[str, Module] = field(default_factory=dict)
+    """Stubs, by the names of the packages that load the names in their stubs lazily."""
 
     @cached_property
     def imports(self) -> dict[str, set[str]]:
         """Imports of each module within the product, including those inside functions and for types only."""
-        return {name: set(_imported(module, self.modules)) - {name} for name, module in self.modules.items()}
+        return {name: set(imports_of(module, self.modules)) - {name} for name, module in self.modules.items()}
 
     @cached_property
     def importers(self) -> dict[str, set[str]]:
@@ -110,7 +112,8 @@ class House:
         return found
 
 
-def _imported(module: Module, known: Container[str]) -> Iterator[str]:
+def imports_of(module: Module, known: Container[str]) -> Iterator[str]:
+    """Yield the names of the modules that a module imports and that are in `known`."""
     return (name for node in module.nodes for name in imported_by(node, known))
 
 
@@ -136,10 +139,12 @@ def read_house(root: Path) -> House:
     pages = [*sorted((root / "docs").rglob("*.md")), *sorted(root.glob("*.md"))]
     users = [*(root / "docs").rglob("*.py"), *(root / "benchmarks").rglob("*.py"), *(root / "migrations").rglob("*.py")]
     users += [root / "pyproject.toml", root / "Makefile", *root.glob("*/marey_*/__init__.pyi")]
+    stubs = [read_stub(path) for path in sorted(root.glob("*/marey*/__init__.pyi"))]
     return House(
         {module.name: module for module in modules},
         {path: text for path in pages if not (text := path.read_text("utf-8")).startswith(GENERATED)},
         {path: path.read_text("utf-8") for path in users if path.is_file()},
+        {stub.name: stub for stub in stubs},
     )
 
 
@@ -148,3 +153,10 @@ def read_module(path: Path, root: Path) -> Module:
     parts = path.relative_to(root).with_suffix("").parts
     is_package = parts[-1] == "__init__"
     return Module(".".join(parts[:-1] if is_package else parts), path, path.read_text("utf-8"), is_package)
+
+
+def read_stub(path: Path) -> Module:
+    """Return the stub of a package, as a module with absolute imports; the stub itself must have relative imports."""
+    package = path.parent.name
+    text = path.read_text("utf-8").replace("from . ", f"from {package} ").replace("from .", f"from {package}.")
+    return Module(package, path, text, is_package=True)

@@ -28,7 +28,7 @@ from lint.exceptions import (
     shrink_baseline,
 )
 from lint.sample import draw
-from lint.sources import House, Module, Offence
+from lint.sources import House, Module, Offence, read_house
 
 ROOT = Path("/checkout")
 LONG = "\n".join("x = 1" for _ in range(70)) + "\n"
@@ -69,6 +69,17 @@ def test_a_circle_through_two_packages_is_found() -> None:
     circle = house({"marey_x.a": "import marey_y.b\n", "marey_y.b": "def f():\n    from marey_x import a\n"})
     (offence,) = circles.find(circle)
     assert "marey_x.a -> marey_y.b -> marey_x.a; move" in offence.message
+
+
+def test_a_circle_through_the_lazy_names_of_a_package_is_found(tmp_path: Path) -> None:
+    package = tmp_path / "motion/marey_motion"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("import lazy_loader\n")
+    (package / "__init__.pyi").write_text("from . import __version__ as __version__\nfrom .clip import Clip as Clip\n")
+    (package / "clip.py").write_text("def f():\n    from marey_motion import Clip\n")
+    (offence,) = circles.find(read_house(tmp_path))
+    assert "marey_motion -> marey_motion.clip -> marey_motion; move" in offence.message
+    assert (offence.path.name, offence.line) == ("__init__.pyi", 2)
 
 
 def test_modules_that_import_downwards_are_no_circle() -> None:
