@@ -29,13 +29,23 @@ def find(house: House) -> Iterator[Offence]:
         if PurePath(path).parts[-3:-1] != ("migrations", "versions"):
             continue
         tree = ast.parse(text)
-        phase = _texts(tree).get("phase", "stopped")
-        if phase not in PHASES:
+        phase = _phase_of(tree)
+        if not phase:
+            message = 'the phase cannot be read; assign the text itself to it, as in `phase = "before"`'
+            yield Offence(path, 1, path.stem, message)
+        elif phase not in PHASES:
             yield Offence(path, 1, path.stem, f"the phase {phase!r} is unknown; the phases are {', '.join(PHASES)}")
         elif phase == "before":
             for place, reason in _faults(tree):
                 message = f"{reason}; declare the phase `stopped` or `after`, or only add"
                 yield Offence(path, getattr(place, "lineno", 1), path.stem, message)
+
+
+def _phase_of(tree: ast.Module) -> str:
+    """Return the phase that a migration declares, by default `stopped`; empty if this declaration is not a text."""
+    names = (node for node in ast.walk(tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store))
+    is_declared = any(node.id == "phase" for node in names)
+    return _texts(tree).get("phase", "" if is_declared else "stopped")
 
 
 def _texts(tree: ast.Module) -> dict[str, str]:

@@ -397,6 +397,13 @@ def test_a_migration_of_an_unknown_phase_is_found() -> None:
     assert "the phase 'befor' is unknown" in message
 
 
+@pytest.mark.parametrize("declared", ['EARLY = "before"\nphase = EARLY', 'revision, phase = "0099", "before"'])
+def test_a_phase_that_is_not_declared_as_a_text_is_found(declared: str) -> None:
+    path = ROOT / "migrations" / "versions" / "0099_next.py"
+    (message,) = messages(migrations.find(House({}, {}, {path: declared + "\n"})))
+    assert "the phase cannot be read; assign the text itself" in message
+
+
 def test_the_command_checks_every_rule() -> None:
     """Plant an offence for each rule; each message has a remedy after a semicolon or a colon."""
     text = "import marey_motion.b\nMOST = 3\nWORDS = ('one', 'two', 'three')\nclass Take: ...\ndef turned(): ...\n"
