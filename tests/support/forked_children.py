@@ -31,6 +31,8 @@ from tests.support.awaited_programs import AwaitedProgram
 from marey_schemas.processes import child_process
 from marey_schemas.processes.child_process import exit_status
 from marey_schemas.processes.limits import die_with_parent
+from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
+from marey_server import faults
 from marey_server.process import programs
 
 FORKS = sys.platform == "linux"
@@ -173,6 +175,14 @@ def take_name(arguments: Sequence[str]) -> None:
     ctypes.memmove(start, text.ljust(end - start, b"\0"), end - start)
 
 
+def take_on(environment: dict[str, str]) -> None:
+    """Adopt the environment of a program, and read the variables again that modules read when they are imported."""
+    os.environ.clear()
+    os.environ.update(environment)
+    sys.path[1:1] = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path not in sys.path]
+    faults.plan(environment.get(FAULT_VARIABLE, ""))
+
+
 def _adopt_orphans(adopts: bool) -> None:
     if ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, int(adopts), 0, 0, 0) != 0:
         raise OSError("the system does not let this process adopt orphans")
@@ -233,8 +243,6 @@ def _place(descriptors: list[int], places: list[int]) -> None:
 
 
 def _run(module: str, arguments: list[str], environment: dict[str, str], program: bool) -> NoReturn:
-    from tests.support.forked_programs import take_on
-
     take_on(environment)
     sys.argv = [module, *arguments]
     if program:

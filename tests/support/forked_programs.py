@@ -36,6 +36,7 @@ from tests.support.forked_children import (
     PID,
     fork_children,
     take_name,
+    take_on,
 )
 from tests.support.forked_children import MODULES as CHILDREN_RUN
 
@@ -268,17 +269,6 @@ def adopt(
     if FORKS and not own_children:
         fork_children()
     return arguments
-
-
-def take_on(environment: dict[str, str]) -> None:
-    """Adopt the environment of a program, and read the variables again that modules read when they are imported."""
-    from marey_schemas.queue.worker_protocol import FAULT_VARIABLE
-    from marey_server import faults
-
-    os.environ.clear()
-    os.environ.update(environment)
-    sys.path[1:1] = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path not in sys.path]
-    faults.plan(environment.get(FAULT_VARIABLE, ""))
 
 
 if __name__ == "__main__":

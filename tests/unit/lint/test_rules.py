@@ -28,7 +28,7 @@ from lint.exceptions import (
     shrink_baseline,
 )
 from lint.sample import draw
-from lint.sources import House, Module, Offence, read_house
+from lint.sources import House, Module, Offence, read_house, read_module
 
 ROOT = Path("/checkout")
 LONG = "\n".join("x = 1" for _ in range(70)) + "\n"
@@ -80,6 +80,13 @@ def test_a_circle_through_the_lazy_names_of_a_package_is_found(tmp_path: Path) -
     (offence,) = circles.find(read_house(tmp_path))
     assert "marey_motion -> marey_motion.clip -> marey_motion; move" in offence.message
     assert (offence.path.name, offence.line) == ("__init__.pyi", 2)
+
+
+@pytest.mark.parametrize("folder", ["tests/support", "benchmarks", "lint"])
+def test_the_modules_beside_the_packages_have_no_circle(folder: str) -> None:
+    checkout = Path(__file__).parents[3]
+    modules = [read_module(path, checkout) for path in (checkout / folder).rglob("*.py")]
+    assert messages(circles.find(House({module.name: module for module in modules}))) == []
 
 
 def test_modules_that_import_downwards_are_no_circle() -> None:
