@@ -41,6 +41,7 @@ MISTAKES: tuple[tuple[str, int, str], ...] = (
     ("token create t --scope raed", 2, "one of the scopes read, write, jobs, work, admin"),
     ("member put lab admin writer", 2, "'reader', 'contributor', 'maintainer' or 'owner'"),
     ("user create Jürgen", 2, "name: the text must have at most 64 lower-case letters"),
+    ("edit apply 'lab/walks/walk 1 0' --into e --in-place --do smooth", 2, "cannot be combined with --into"),
     ("edit apply 'lab/walks/walk 1 0' --into e --do 'trim start=five'", 2, "start: the value must be a whole number"),
     # projects, folders and items
     ("ls lba", 1, "; did you mean lab?"),

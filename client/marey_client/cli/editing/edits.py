@@ -65,6 +65,8 @@ def apply_edit(
             "choose where the results go: --into FOLDER, --suffix TEXT (next to the clips, with this text "
             "added to their names), or --in-place (new revisions of the clips)"
         )
+    if into and params.get("in_place"):
+        raise WrongUsage("--in-place cannot be combined with --into, because it makes new revisions of the clips")
     with connect(context) as marey:
         commands = _commands(marey, addresses[0].project, do, file, saved)
         clips = [clips_at(marey, address) for address in addresses]
