@@ -85,6 +85,8 @@ def joint_axes(
     with connect(context) as marey:
         found = require_item(marey, Address.parse(place), [Kind.SKELETON])
         mapping = found.mapping()
+        if joint is not None and joint not in mapping.axes:
+            _require_joint(joint, {one.name for one in found.hierarchy().joints})
         if twist or swing:
             if joint is None:
                 raise WrongUsage("name the joint whose axes `--twist` or `--swing` changes")
@@ -169,10 +171,16 @@ def _assigned(assignments: list[str], known: set[str], mapped: Mapping[str, str]
             raise WrongUsage(f"{assignment!r} does not map a joint; write standard_joint=JointName")
         if standard not in STANDARD_JOINTS and (joint or standard not in mapped):
             raise WrongUsage(f"{standard!r} is not a standard joint{_nearest(standard, STANDARD_JOINTS)}")
-        if joint and joint not in known:
-            raise WrongUsage(f"{joint!r} is not a joint of this skeleton{_nearest(joint, sorted(known))}")
+        if joint:
+            _require_joint(joint, known)
         given[standard] = joint
     return given
+
+
+def _require_joint(joint: str, known: set[str]) -> None:
+    """Raise `WrongUsage`, with the most similar joints, if `known` does not contain `joint`."""
+    if joint not in known:
+        raise WrongUsage(f"{joint!r} is not a joint of this skeleton{_nearest(joint, sorted(known))}")
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:

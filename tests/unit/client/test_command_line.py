@@ -569,7 +569,10 @@ def test_who_interrupts_a_download_is_told_what_is_complete(tmp_path: Path, caps
 
 
 def test_a_joint_without_axes_is_given_both_of_its_axes(monkeypatch: pytest.MonkeyPatch) -> None:
+    elbow = mock.Mock()
+    elbow.name = "LeftForeArm"  # `Mock(name=...)` names the mock instead
     item = mock.Mock(mapping=lambda: SkeletonMapping(joints={"left_elbow": "LeftForeArm"}))
+    item.hierarchy.return_value.joints = [elbow]
     monkeypatch.setattr(skeletons, "connect", mock.MagicMock())
     monkeypatch.setattr(skeletons, "require_item", lambda *_: item)
     with pytest.raises(WrongUsage, match="'LeftForeArm' has no axes yet; give it both `--twist` and `--swing`"):

@@ -36,17 +36,33 @@ def test_a_name_that_is_not_standard_can_be_cleared() -> None:
     assert _assigned(["leftankle="], KNOWN, MAPPED) == {"leftankle": ""}
 
 
+class NoServer:
+    def __enter__(self) -> NoServer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def project(self, _: str) -> None:
+        pass
+
+
+@pytest.mark.parametrize("change", [[], ["--twist", "1,0,0"], ["--twist", "1,0,0", "--swing", "0,1,0"]])
+def test_axes_of_a_joint_that_the_skeleton_lacks_are_refused(
+    change: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    skeleton = SimpleNamespace(
+        mapping=lambda: SimpleNamespace(axes={}),
+        hierarchy=lambda: SimpleNamespace(joints=[SimpleNamespace(name=name) for name in sorted(KNOWN)]),
+    )
+    monkeypatch.setattr(skeletons, "connect", lambda context: NoServer())
+    monkeypatch.setattr(skeletons, "require_item", lambda *_: skeleton)
+    done = run_here(["skeleton", "axes", "lab/b", "Foot_X", *change])
+    assert done.returncode == 2
+    assert "'Foot_X' is not a joint of this skeleton; did you mean Foot_" in done.stderr
+
+
 def test_one_skeleton_alone_is_not_merged(monkeypatch: pytest.MonkeyPatch) -> None:
-    class NoServer:
-        def __enter__(self) -> NoServer:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-        def project(self, _: str) -> None:
-            pass
-
     monkeypatch.setattr(skeletons, "connect", lambda context: NoServer())
     monkeypatch.setattr(skeletons, "require_item", lambda *_: SimpleNamespace(id="skeleton_b"))
     for words in (["lab/b"], ["lab/b", "lab/b"], ["lab/b", "--keep", "lab/b"]):
