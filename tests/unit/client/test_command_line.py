@@ -393,6 +393,17 @@ def test_a_token_that_is_refused_is_told_with_the_place_it_came_from(
         assert ("MAREY_TOKEN" in sentence(refused.value)) is not anonymous
 
 
+@pytest.mark.parametrize("what", ["job", "dataset", "script", "schedule", "webhook"])
+def test_what_a_project_lacks_is_answered_with_the_command_that_lists_what_it_has(
+    script: ScriptedServer, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    monkeypatch.setattr("marey_client.marey.Marey", lambda *_, **_options: script.marey())
+    script.answers = [problem(404, f"no-{what}")]
+    with pytest.raises(NotFound) as missing, connect(NO_OPTIONS) as marey:
+        marey.me()
+    assert f"`marey {what} ls PROJECT` lists the {what}s" in sentence(missing.value)
+
+
 def answering(script: ScriptedServer, token: str | None) -> Marey:
     return Marey("http://server.test", token, http=httpx.MockTransport(script))
 

@@ -140,6 +140,9 @@ _LISTED = {
     "no-job": "`marey job ls PROJECT` lists the jobs of a project",
     "no-user": "`marey user ls` lists the users, for administrators",
     "no-dataset": "`marey dataset ls PROJECT` lists the datasets of a project",
+    "no-script": "`marey script ls PROJECT` lists the scripts of a project",
+    "no-schedule": "`marey schedule ls PROJECT` lists the schedules of a project",
+    "no-webhook": "`marey webhook ls PROJECT` lists the webhooks of a project",
 }
 """Advice on how to find what does not exist, by the code of the error."""
 
