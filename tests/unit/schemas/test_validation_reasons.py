@@ -1,5 +1,6 @@
 from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 from pkgutil import walk_packages
 from typing import Annotated, Any, Literal
 
@@ -51,6 +52,7 @@ class Session(BaseModel):
     counts: dict[str, int] = Field({}, min_length=1)
     range: tuple[int, int] = (0, 1)
     quiet: bool = False
+    folder: Path = Path()
 
 
 @pytest.mark.parametrize(
@@ -79,6 +81,7 @@ class Session(BaseModel):
         ({"name": ""}, "name: the text must not be empty"),
         ({"name": "n" * 10}, "name: the text must have at most 9 characters"),
         ({"name": 5}, "name: the value must be text"),
+        ({"folder": 3}, "folder: the value must be text"),
         ({"code": "y"}, "code: the text must have another form; it may contain a character that is not allowed"),
         ({"counts": {}}, "counts: the object must not be empty"),
         ({"counts": {"a": "many"}}, "counts.a: the value must be a whole number"),
