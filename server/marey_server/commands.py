@@ -167,11 +167,13 @@ def require_empty(**settings: Any) -> None:
 def backup(*, target: Path, **settings: Any) -> None:
     """Copy an SQLite database to the file `target`, in a consistent state even while a server is writing to it.
 
-    Raises `CommandFailed` if the file exists already.
+    Raises `CommandFailed` if the file exists already, or if its folder does not exist.
     """
     source = _sqlite_file(read_settings(**settings), must_exist=True)
     if target.exists():
         raise CommandFailed(f"the file {target} exists already; choose a file that does not exist")
+    if not target.parent.is_dir():
+        raise CommandFailed(f"{target}: there is no folder {target.parent}; create it, or name another file")
     partial = target.with_name(f"{target.name}.partial")
     partial.unlink(missing_ok=True)
     _copy_database(source, partial)

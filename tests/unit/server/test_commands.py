@@ -66,6 +66,12 @@ def test_a_backup_never_writes_over_a_file(data: Path, tmp_path: Path) -> None:
     assert (tmp_path / "copy.db").read_text() == "precious"
 
 
+def test_a_backup_into_a_folder_that_does_not_exist_names_the_file_that_was_given(data: Path, tmp_path: Path) -> None:
+    target = tmp_path / "missing" / "copy.db"
+    with pytest.raises(commands.CommandFailed, match=f"^{target}: there is no folder {target.parent}; create it"):
+        commands.backup(target=target, data=data)
+
+
 @pytest.mark.parametrize("left", ["marey.db", "marey.db-wal", "marey.db-shm"])
 def test_nothing_is_restored_over_or_beside_what_a_server_left(data: Path, tmp_path: Path, left: str) -> None:
     commands.backup(target=tmp_path / "copy.db", data=data)
