@@ -507,3 +507,16 @@ def test_a_push_of_one_relabelled_clip_sends_less_than_twenty_kilobytes_in_all(
     assert partner.datasets.pull(gaits, "gaits").commit == made
     assert len(sent) <= 12
     assert sum(size for _, size in sent) < 20_000
+
+
+def test_a_copy_moves_no_tag_of_the_target_and_says_so(
+    lab: ProjectHandle, partner: ProjectHandle, gaits: DatasetHandle
+) -> None:
+    first = commit(gaits, rig=make_rig(lab))
+    partner.datasets.pull(gaits, "gaits")
+    partner.datasets.at("gaits").create_tag("v1", first.digest)
+    second = commit(gaits, tall=make_rig(lab, joints=3, name="tall"))
+    made = partner.datasets.pull(gaits, "gaits", into="v1")
+    assert (made.commit, made.branch, made.moved) == (second, "v1", False)
+    assert partner.datasets.at("gaits").at("v1") == first
+    assert partner.datasets.at("gaits").at(second.digest) == second

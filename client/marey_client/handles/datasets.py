@@ -161,7 +161,7 @@ def _receive(
 
     empty = ref is not None and ref.commit is None
     made = send_versions(dataset, archive, on_progress, has, begins=into if empty else None)
-    if ref is not None and ref.commit in archive.manifest.base:
+    if ref is not None and ref.kind is RefKind.BRANCH and ref.commit in archive.manifest.base:
         with suppress(Conflict):  # the branch has moved, or is protected
             merged = dataset.merge(made.digest, into=into, expected=ref.commit)
             if merged.commit is not None and merged.commit.digest == made.digest:
