@@ -76,8 +76,13 @@ class ModelQueue:
         return job.state == "running" and job.fence == fence
 
     def renew(self, job_id: str, now_us: int) -> None:
-        """Extend a lease that is held, as a repeated claim does."""
+        """Extend a lease that is held, as a repeated claim does.
+
+        The time since the end of an expired lease does not count towards the time limit: the clock may have jumped.
+        """
         job = self.jobs[job_id]
+        if job.lease_expires_us < now_us and not job.cancel_requested:
+            job.deadline_us += now_us - job.lease_expires_us
         job.lease_expires_us = min(now_us + TTL_US, job.deadline_us + GRACE_US)
 
     def write(self, job_id: str) -> None:
