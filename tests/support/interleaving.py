@@ -39,7 +39,7 @@ class Abandoned(Exception):
 
 def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, Any]:
     """Interleave two transactions; return the result or error of each. Without `commit`, the first is rolled back."""
-    wrote, may_end = threading.Event(), threading.Event()
+    wrote, began, may_end = threading.Event(), threading.Event(), threading.Event()
 
     def held_open(tx: Transaction) -> Any:
         try:
@@ -51,10 +51,16 @@ def interleave(first: Step, second: Step, *, commit: bool = True) -> tuple[Any, 
             raise Abandoned
         return answer
 
+    def begun(tx: Transaction) -> Any:
+        began.set()
+        return second.action(tx)
+
     with ThreadPoolExecutor(2) as pool:
         one = pool.submit(first.database.write, first.principal, held_open)
         assert wrote.wait(PATIENCE_S)
-        two = pool.submit(second.database.write, second.principal, second.action)
+        two = pool.submit(second.database.write, second.principal, begun)
+        if not second.database.is_sqlite:  # on SQLite, the second transaction begins when the first one has ended
+            assert began.wait(PATIENCE_S)
         with contextlib.suppress(StillRunning):
             two.exception(HEAD_START_S)
         may_end.set()
